@@ -1,0 +1,39 @@
+"""Sparse precomputed radiance transfer for Mitsuba 3."""
+
+import sys as _sys
+from pathlib import Path as _Path
+
+from .errors import PrtError, PrtWarning
+from .variant import choose_variant, variant
+
+__version__ = "0.1.0"
+
+try:
+    choose_variant()  # before any module that uses Mitsuba's types
+except PrtError as _error:
+    # the command line says one line; Python programs get the exception ("-m": python -m mi_sparse_prt...)
+    if _Path(_sys.argv[0]).name in ("mi-sparse-prt", "-m"):
+        raise SystemExit(f"mi-sparse-prt: {_error}") from None
+    raise
+
+from .emission.cubemap import CubemapLighting  # noqa: E402
+from .emission.environment import Environment, load_environment  # noqa: E402
+from .matrix import LightTransport  # noqa: E402
+from .precompute import precompute  # noqa: E402
+from .scene import Scene, load_scene  # noqa: E402
+from .storage import load_transport  # noqa: E402
+
+__all__ = [
+    "CubemapLighting",
+    "Environment",
+    "LightTransport",
+    "PrtError",
+    "PrtWarning",
+    "Scene",
+    "__version__",
+    "load_environment",
+    "load_scene",
+    "load_transport",
+    "precompute",
+    "variant",
+]

@@ -1,0 +1,206 @@
+"""Equirectangular HDR images as light from infinitely far away: reading, checking and rotating them.
+
+Orientation is that of Mitsuba's `envmap`: y is up; a direction d of the environment's own frame lies at
+u = atan2(d.x, -d.z) / 2 pi (mod 1) and v = acos(d.y) / pi, u along a row, v = 0 at the top. Pixel (row, col) of an
+image of h x w pixels is the cell [row, row + 1) / h x [col, col + 1) / w of that square, so the cells tile the sphere
+and every pixel has an exact solid angle.
+
+Mitsuba 3.9.1's `envmap` agrees horizontally (pixel centres at (col + 1/2) / w) but interpolates vertically from pole to
+pole: its row centres are at v = row / (h - 1), not (row + 1/2) / h. The same file seen through `envmap` is therefore
+stretched by up to half a pixel at the poles (nothing at the horizon) and blurred by one pixel.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mi_sparse_prt.emission.equirectangular import pixel_solid_angles
+from mi_sparse_prt.errors import PrtError, PrtWarning
+
+SUFFIXES = (".exr", ".hdr", ".pfm")
+
+
+class Environment:
+    """Radiance that arrives from every direction, constant over each pixel of an equirectangular image.
+
+    Parameters
+    ----------
+    pixels : (h, w, 3) array
+        Linear RGB radiance, w = 2 h within a tenth. Negative values are clamped to zero with a `PrtWarning`.
+    rotation : (3, 3) array, optional
+        World from environment frame; the identity by default.
+    source : str
+        What error messages call the image: its path.
+
+    Attributes
+    ----------
+    pixels : (h, w, 3) float32
+        Clamped radiance, in the environment's own frame.
+    rotation : (3, 3) float64
+        A world direction is `rotation @ direction_of_environment`.
+    report : dict
+        `source`, `width`, `height`, and what the clamped values were: `negative_pixels` (pixels with a negative
+        channel), `negative_pixel_share`, `negative_energy_share` (their part of the absolute energy: the sum of
+        |radiance| x solid angle over all channels).
+
+    Raises
+    ------
+    PrtError
+        If the image has NaN or infinite pixels or not the shape above, or `rotation` is not a rotation.
+    """
+
+    def __init__(self, pixels: ArrayLike, rotation: ArrayLike | None = None, source: str = "environment") -> None:
+        pixels = np.array(pixels, dtype=np.float32)  # [h, w, rgb], a copy of our own
+        _check_shape(pixels, source)
+        _check_finite(pixels, source)
+        self.report: dict[str, Any] = {"source": source, "width": pixels.shape[1], "height": pixels.shape[0]}
+        self.report |= _clamp_negative(pixels, source)
+        self.pixels: NDArray[np.float32] = pixels
+        self.rotation: NDArray[np.float64] = np.eye(3) if rotation is None else _checked_rotation(rotation)
+
+    @property
+    def solid_angles(self) -> NDArray[np.float64]:
+        """Exact solid angle of every pixel, (h, w), in steradians; they sum to 4 pi."""
+        return pixel_solid_angles(*self.pixels.shape[:2])
+
+    def rotated(self, rotation: ArrayLike) -> Environment:
+        """The same light turned in the world; no pixel is touched.
+
+        Parameters
+        ----------
+        rotation : float or (3, 3) array
+            Degrees about +y, counter-clockwise seen from above (Mitsuba's `rotate(axis=[0, 1, 0], angle)`), or a
+            rotation matrix. It applies after the rotation the environment already has.
+
+        Raises
+        ------
+        PrtError
+            If a matrix is not 3 x 3, orthonormal and of determinant 1 within 1e-4.
+        """
+        turn = _about_up(float(rotation)) if np.ndim(rotation) == 0 else _checked_rotation(rotation)  # type: ignore[arg-type]
+        turned = copy.copy(self)
+        turned.rotation = turn @ self.rotation
+        return turned
+
+    def __repr__(self) -> str:
+        return f"Environment({self.report['source']!r}, {self.report['width']} x {self.report['height']})"
+
+
+def load_environment(path: str | os.PathLike[str]) -> Environment:
+    """Read an equirectangular HDR image (.exr, .hdr or .pfm; any float width, RGB or grey, alpha is dropped).
+
+    Parameters
+    ----------
+    path : path
+        The file. See the module's docstring for its orientation and how it compares with Mitsuba's `envmap`.
+
+    Returns
+    -------
+    Environment
+        Its `report` tells what had to be clamped.
+
+    Raises
+    ------
+    PrtError
+        One line that names the file: missing, unknown suffix, not readable, channels that are no RGB or grey,
+        not about twice as wide as high, or NaN or infinite pixels (their number and the first one).
+
+    Warns
+    -----
+    PrtWarning
+        If pixels were negative: how many, and their share of the image's energy.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise PrtError(f"{path}: not an HDR image by its name; give a file that ends in {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise PrtError(f"{path}: no such file")
+    try:
+        bitmap = mi.Bitmap(str(path))
+    except (RuntimeError, MemoryError) as error:
+        reason = " ".join(str(error).split())
+        raise PrtError(f"{path}: cannot be read as an image, export it again ({reason})") from error
+    return Environment(_rgb_of(bitmap, path), source=str(path))
+
+
+def _rgb_of(bitmap: mi.Bitmap, path: Path) -> NDArray[np.float32]:
+    """(h, w, 3) linear RGB of a bitmap, without conversion of its values."""
+    formats = mi.Bitmap.PixelFormat
+    pixels = np.array(bitmap, dtype=np.float32)
+    pixels = pixels.reshape(*pixels.shape[:2], -1)  # [h, w, channel]; grey bitmaps may come without the last axis
+    if bitmap.pixel_format() in (formats.RGB, formats.RGBA):
+        return pixels[..., :3]
+    if bitmap.pixel_format() in (formats.Y, formats.YA):
+        return np.repeat(pixels[..., :1], 3, axis=2)
+    channels = ", ".join(field.name for field in bitmap.struct_())
+    raise PrtError(f"{path}: has the channels {channels}; export an RGB or grey image")
+
+
+def _check_shape(pixels: NDArray[np.float32], source: str) -> None:
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise PrtError(f"{source}: pixels have shape {pixels.shape}; an environment is (height, width, 3)")
+    height, width = pixels.shape[:2]
+    if abs(width / height - 2) > 0.2:
+        raise PrtError(
+            f"{source}: {width} x {height} pixels; an equirectangular image is twice as wide as high, "
+            "convert other layouts first"
+        )
+
+
+def _check_finite(pixels: NDArray[np.float32], source: str) -> None:
+    bad = ~np.isfinite(pixels).all(axis=2)  # [h, w]
+    if bad.any():
+        row, col = np.argwhere(bad)[0]
+        raise PrtError(
+            f"{source}: {bad.sum()} of {bad.size} pixels are NaN or infinite, the first at row {row}, column {col} "
+            f"{pixels[row, col].tolist()}; repair the image"
+        )
+
+
+def _clamp_negative(pixels: NDArray[np.float32], source: str) -> dict[str, Any]:
+    """Clamp in place; returns the report's entries and warns when there was anything to clamp."""
+    negative = (pixels < 0).any(axis=2)  # [h, w]
+    share = 0.0
+    if negative.any():
+        absolute = np.abs(pixels, dtype=np.float64) * pixel_solid_angles(*pixels.shape[:2])[..., None]
+        share = float(absolute[pixels < 0].sum() / absolute.sum())
+        np.maximum(pixels, 0, out=pixels)
+        warnings.warn(
+            f"{source}: {negative.sum()} pixels ({negative.mean():.2%}) were negative and are clamped to 0; "
+            f"they had {share:.2%} of the image's energy",
+            PrtWarning,
+            stacklevel=4,
+        )
+    return {
+        "negative_pixels": int(negative.sum()),
+        "negative_pixel_share": float(negative.mean()),
+        "negative_energy_share": share,
+    }
+
+
+def _about_up(degrees: float) -> NDArray[np.float64]:
+    if not np.isfinite(degrees):
+        raise PrtError(f"rotation by {degrees} degrees: give a finite angle")
+    # Quarter turns are exact, so that they permute texels and nothing else
+    sine, cosine = (round(v) if degrees % 90 == 0 else v for v in (np.sin(np.radians(degrees)), np.cos(np.radians(degrees))))
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], dtype=np.float64)
+
+
+def _checked_rotation(matrix: ArrayLike) -> NDArray[np.float64]:
+    matrix = np.array(matrix, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise PrtError(f"rotation has shape {matrix.shape}; give degrees about y or a 3 x 3 matrix")
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not error < 1e-4:
+        raise PrtError(f"rotation matrix is not orthonormal (off by {error:.2g}); it may not scale or shear")
+    if np.linalg.det(matrix) < 0:
+        raise PrtError("rotation matrix has determinant -1: it mirrors; flip one of its axes")
+    return matrix

@@ -1,0 +1,9 @@
+"""The two ways in which the package speaks of trouble: one line that says what is wrong, where, and what to do."""
+
+
+class PrtError(ValueError):
+    """Input or a file that cannot be used; the message is one line for the user, never a traceback's worth."""
+
+
+class PrtWarning(UserWarning):
+    """Something was handled on the user's behalf (negative pixels clamped, a mesh facing inwards)."""

@@ -1,0 +1,366 @@
+"""The result: a factored light transport matrix T ([HR10] eq. 1), stored in incident form ([Leh07] 2.4).
+
+``T[i, j, c] = albedo[i, c] * (direct[i, j] + indirect[i, j, c])``. Both parts are *white* transport: what a vertex of
+albedo 1 would send out. Direct light needs one channel and no more than its visibility; indirect light is smooth and
+may have fewer directions; colour exists only where the scene has any.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
+
+Rows = NDArray[np.integer]
+
+
+class Part(Protocol):
+    """One additive part of white transport."""
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        """White rows (len(ids), n_directions, channels), float32."""
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        """White columns (n_v, len(ids), channels), float32."""
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        """White radiance (n_v, 3) under L (n_directions, 3)."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the part keeps in memory."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """Direct light in the direction basis: one bit per element, cosine and solid angle analytic.
+
+    Attributes
+    ----------
+    bits : (n_v, n_directions / 32) uint32
+        Bit j % 32 of word j // 32: whether texel j's centre is seen (never below the horizon).
+    normals : (n_v, 3) float32, world
+    lighting : CubemapLighting
+    """
+
+    bits: NDArray[np.uint32]
+    normals: NDArray[np.float32]
+    lighting: CubemapLighting
+
+    @property
+    def nbytes(self) -> int:
+        return self.bits.nbytes
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        directions = self.lighting.directions
+        seen = np.unpackbits(self.bits[ids].view(np.uint8), axis=1, bitorder="little")[:, : len(directions)]
+        white = np.maximum(self.normals[ids] @ directions.T, 0) * self._weights()  # [row, direction]
+        return (white * seen)[..., None]
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        ids = np.asarray(ids)
+        words = self.bits[:, ids // BITS]  # [vertex, column]
+        seen = (words >> (ids % BITS).astype(np.uint32)) & 1
+        cosine = np.maximum(self.normals @ self.lighting.directions[ids].T, 0)
+        return (cosine * seen * self._weights()[ids])[..., None].astype(np.float32)
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        n_padded = self.bits.shape[1] * BITS
+        directions = np.zeros((3, n_padded), dtype=np.float32)
+        power = np.zeros((3, n_padded), dtype=np.float32)
+        directions[:, : len(lighting)] = self.lighting.directions.T
+        power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
+        return _relight_bits(self.bits, self.normals, directions, power)
+
+    def reordered(self, source: Rows) -> Visibility:
+        return replace(self, bits=self.bits[source], normals=self.normals[source])
+
+    def _weights(self) -> NDArray[np.float32]:
+        return self.lighting.solid_angles / np.float32(np.pi)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _relight_bits(
+    bits: NDArray[np.uint32],
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    power: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Sum of power[:, j] * max(0, n_i . w_j) over the set bits j of row i; the inner loop is one word of bits."""
+    radiance = np.zeros((bits.shape[0], 3), dtype=np.float32)
+    for i in numba.prange(bits.shape[0]):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+        for word in range(bits.shape[1]):
+            mask = bits[i, word]
+            if mask == 0:
+                continue
+            for k in range(32):
+                j = word * 32 + k
+                cosine = nx * directions[0, j] + ny * directions[1, j] + nz * directions[2, j]
+                seen = max(cosine, np.float32(0)) * np.float32((mask >> np.uint32(k)) & np.uint32(1))
+                red += seen * power[0, j]
+                green += seen * power[1, j]
+                blue += seen * power[2, j]
+        radiance[i, 0], radiance[i, 1], radiance[i, 2] = red, green, blue
+    return radiance
+
+
+@dataclass(frozen=True)
+class MeanCosine:
+    """Direct light in the texel basis: the mean of V max(0, n . w) over each texel.
+
+    Attributes
+    ----------
+    fixed : (n_v, n_directions) uint16
+        The mean as 16-bit fixed point, 65535 = 1.
+    lighting : CubemapLighting
+    """
+
+    fixed: NDArray[np.uint16]
+    lighting: CubemapLighting
+
+    @property
+    def nbytes(self) -> int:
+        return self.fixed.nbytes
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        return (self.fixed[ids] * self._weights())[..., None]
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        return (self.fixed[:, ids] * self._weights()[ids])[..., None]
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        return _in_blocks(self.fixed, lighting * self._weights()[:, None])
+
+    def reordered(self, source: Rows) -> MeanCosine:
+        return replace(self, fixed=self.fixed[source])
+
+    def _weights(self) -> NDArray[np.float32]:
+        return self.lighting.solid_angles / np.float32(np.pi * FIXED_POINT)
+
+
+@dataclass(frozen=True)
+class Indirect:
+    """Interreflected light: white transport per solid angle, at the lighting's directions or at fewer.
+
+    Attributes
+    ----------
+    density : (n_v, n_coarse, channels) float16, 1/sr
+        channels is 1 in a grey scene.
+    upsampling : (n_directions, n_coarse) sparse, rows sum to 1
+        Interpolates a coarse cubemap at the lighting's directions; the identity where none is coarser.
+    lighting : CubemapLighting
+    """
+
+    density: NDArray[np.float16]
+    upsampling: scipy.sparse.csr_array
+    lighting: CubemapLighting
+
+    @property
+    def nbytes(self) -> int:
+        return self.density.nbytes
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        density = self.density[ids].astype(np.float32)  # [row, coarse, channel]
+        fine = np.stack([(self.upsampling @ density[..., c].T).T for c in range(density.shape[2])], axis=-1)
+        return fine * self.lighting.solid_angles[:, None]
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        weights = self.upsampling[np.asarray(ids)].multiply(self.lighting.solid_angles[ids][:, None]).tocsr()
+        needed = np.unique(weights.indices)
+        density = self.density[:, needed].astype(np.float32)  # [vertex, needed coarse, channel]
+        return np.stack([(weights[:, needed] @ density[..., c].T).T for c in range(density.shape[2])], axis=-1)
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        coarse = self.upsampling.T @ (lighting * self.lighting.solid_angles[:, None])  # [coarse, rgb]
+        if self.density.shape[2] == 1:
+            return _in_blocks(self.density[..., 0], coarse)
+        channels = [_in_blocks(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
+        return np.concatenate(channels, axis=1)
+
+    def reordered(self, source: Rows) -> Indirect:
+        return replace(self, density=self.density[source])
+
+
+def _in_blocks(matrix: NDArray[Any], vectors: NDArray[np.float32], block: int = 4096) -> NDArray[np.float32]:
+    """A product with a matrix of small numbers, converted to float32 one block of rows at a time."""
+    product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
+    for a in range(0, len(matrix), block):
+        product[a : a + block] = matrix[a : a + block].astype(np.float32) @ vectors
+    return product
+
+
+@dataclass(frozen=True)
+class MeshRange:
+    """Name of a mesh and the slice of its vertices among all."""
+
+    name: str
+    vertices: slice
+
+
+@dataclass(frozen=True)
+class LightTransport:
+    """A precomputed light transport matrix T (n_v, n_directions, 3), factored.
+
+    Attributes
+    ----------
+    lighting : CubemapLighting
+    basis : {"direction", "texel"}
+    albedo : (n_v, 3) float32
+    direct, indirect : Part or None
+        White parts; None where there is no such light.
+    meshes : tuple of MeshRange
+    vertex_keys : (n_v,) uint64
+        Identify vertices whatever their order (see ``Scene.vertex_keys``).
+    scene_hash : str
+    report : dict
+        What was done, skipped, how long it took and how good it is; JSON as it is.
+    """
+
+    lighting: CubemapLighting
+    basis: str
+    albedo: NDArray[np.float32]
+    direct: Visibility | MeanCosine
+    indirect: Indirect | None
+    meshes: tuple[MeshRange, ...]
+    vertex_keys: NDArray[np.uint64]
+    scene_hash: str
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(vertices, directions, 3)."""
+        return len(self.albedo), self.lighting.n_directions, 3
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the stored factors."""
+        return sum(part.nbytes for part in self._parts())
+
+    def rows(self, ids: ArrayLike) -> NDArray[np.float32]:
+        """Rows of T: radiance leaving vertices under light from each texel alone.
+
+        Parameters
+        ----------
+        ids : (k,) integers
+            Vertices.
+
+        Returns
+        -------
+        (k, n_directions, 3) float32
+
+        Raises
+        ------
+        PrtError
+            If an index is out of range.
+        """
+        chosen = _checked(ids, len(self.albedo), "vertex")
+        white = _summed([part.rows(chosen) for part in self._parts()])
+        return self.albedo[chosen][:, None, :] * white
+
+    def columns(self, ids: ArrayLike) -> NDArray[np.float32]:
+        """Columns of T: radiance leaving all vertices under light from one texel each.
+
+        Parameters
+        ----------
+        ids : (k,) integers
+            Texels.
+
+        Returns
+        -------
+        (n_v, k, 3) float32
+
+        Raises
+        ------
+        PrtError
+            If an index is out of range.
+        """
+        chosen = _checked(ids, self.lighting.n_directions, "direction")
+        return self.albedo[:, None, :] * _summed([part.columns(chosen) for part in self._parts()])
+
+    def irradiance(self, lighting: Any) -> NDArray[np.float32]:
+        """What leaves the vertices if they were white: irradiance / pi, (n_v, 3) float32 (see ``relight``)."""
+        radiance = self.lighting.project(lighting)
+        return _summed([part.relight(radiance) for part in self._parts()])
+
+    def relight(self, lighting: Environment | ArrayLike) -> NDArray[np.float32]:
+        """B = T L: radiance leaving the vertices under an environment.
+
+        Parameters
+        ----------
+        lighting : Environment, str, or (n_directions, 3) float
+            An environment is projected to the cubemap first.
+
+        Returns
+        -------
+        (n_v, 3) float32
+        """
+        return self.albedo * self.irradiance(lighting)
+
+    def for_scene(self, scene: Scene) -> LightTransport:
+        """The same matrix with its rows in the order of a scene's vertices.
+
+        Parameters
+        ----------
+        scene : Scene
+            The same geometry and materials; shapes may be merged or come in another order.
+
+        Raises
+        ------
+        PrtError
+            If the matrix belongs to another scene.
+        """
+        if scene.hash != self.scene_hash:
+            raise PrtError(
+                f"this matrix belongs to another scene than {scene.path or 'the one given'} "
+                "(geometry or materials differ); precompute it again"
+            )
+        if np.array_equal(self.vertex_keys, scene.vertex_keys):
+            return self
+        source = np.empty(len(self.vertex_keys), dtype=np.int64)
+        source[np.argsort(scene.vertex_keys, kind="stable")] = np.argsort(self.vertex_keys, kind="stable")
+        return replace(
+            self,
+            albedo=self.albedo[source],
+            direct=self.direct.reordered(source),
+            indirect=self.indirect and self.indirect.reordered(source),
+            meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+            vertex_keys=scene.vertex_keys,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the matrix to one file (see ``storage.save``)."""
+        from mi_sparse_prt.storage import save
+
+        save(self, path)
+
+    def _parts(self) -> list[Part]:
+        return [self.direct] if self.indirect is None else [self.direct, self.indirect]
+
+
+def _checked(ids: ArrayLike, count: int, what: str) -> Rows:
+    chosen = np.atleast_1d(np.asarray(ids))
+    if chosen.dtype == bool:
+        chosen = np.flatnonzero(chosen)
+    if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
+        raise PrtError(f"{what} ids must be a list of integers, not {chosen.dtype} of shape {chosen.shape}")
+    chosen = chosen.astype(np.int64)
+    if chosen.size and (chosen.min() < -count or chosen.max() >= count):
+        raise PrtError(f"{what} id {chosen.max()} is out of range: there are {count}")
+    return np.where(chosen < 0, chosen + count, chosen)
+
+
+def _summed(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return parts[0] if len(parts) == 1 else parts[0] + parts[1]

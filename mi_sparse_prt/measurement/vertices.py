@@ -1,0 +1,162 @@
+"""M, the measurement at mesh vertices: where a row of T is evaluated, and how a Mitsuba sensor gets there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.scene import Scene
+
+# A Mitsuba ray reaches a vertex from just above one of its triangles: this far from the corner towards the
+# triangle's centre (barycentric), and from this height over it (in units of the scene's longest side).
+# Later pairs are for vertices that the first ones miss (slivers, surfaces in contact).
+_APPROACHES = ((1e-2, 2e-4), (3e-2, 1e-4), (1e-1, 3e-5), (3e-2, 1e-3))
+
+
+@dataclass(frozen=True)
+class Points:
+    """Surface points at which transport is measured, in the normalised frame of a scene.
+
+    Attributes
+    ----------
+    positions : (n, 3) float32, normalised frame
+    normals : (n, 3) float32, shading normals: the cosine and the hemisphere
+    offset_normals : (n, 3) float32, the direction in which rays leave the surface before they start. At a vertex it
+        is the shading normal, so that every direction above the horizon starts on the outside; at a sensor's hit it
+        is the geometric normal, as in Mitsuba's ``spawn_ray``.
+    keys : (n,) uint64, what random numbers are derived from: the same point gets the same random numbers in any
+        order and in any block.
+    """
+
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    offset_normals: NDArray[np.float32]
+    keys: NDArray[np.uint64]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def vertex_points(scene: Scene) -> Points:
+    """Return the scene's vertices themselves as measurement points."""
+    return Points(scene.normalised_positions, scene.normals, scene.normals, scene.vertex_keys)
+
+
+@dataclass(frozen=True)
+class VertexRays:
+    """One ray per vertex that ends on the surface beside it, in the frame of the Mitsuba scene it was made for.
+
+    Attributes
+    ----------
+    origins, directions : (n_v, 3) float32
+    missed : (n_v,) bool
+        Vertices at which no approach hit the surface within a triangle's reach (0 unless the vertex is buried in
+        another surface); their ray is kept, and what it hits is another surface.
+    """
+
+    origins: NDArray[np.float32]
+    directions: NDArray[np.float32]
+    missed: NDArray[np.bool_]
+
+
+def vertex_rays(scene: mi.Scene) -> VertexRays:
+    """Find for every mesh vertex of a Mitsuba scene a ray that hits the surface next to it.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        All its shapes are meshes; vertices are counted in the order of the shapes.
+
+    Notes
+    -----
+    A ray shot straight at a vertex misses at borders and poles. Here it starts just above the triangle and ends a
+    hundredth of its size inside. The result is verified by tracing; the vertices that fail are tried again on their
+    other triangles and from other heights.
+    """
+    vertices, triangles = _merged(scene)
+    extent = float(np.ptp(vertices, axis=0).max()) or 1.0
+    owners, rank, corners = _triangles_of_vertices(vertices, triangles)
+    origins = np.zeros_like(vertices)
+    directions = np.zeros_like(vertices)
+    missing = np.ones(len(vertices), dtype=bool)
+    for attempt in range(len(_APPROACHES) * int(rank.max(initial=0) + 1)):
+        step, height = _APPROACHES[attempt % len(_APPROACHES)]
+        chosen = missing[owners] & (rank == attempt // len(_APPROACHES))  # one corner per vertex at most
+        if not chosen.any():
+            continue
+        ids = owners[chosen]
+        o, d, target = _approach(vertices, triangles, corners[chosen], step, height * extent)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)), coherent=True)
+        distance = np.where(hit.is_valid().numpy(), hit.t.numpy(), np.inf)
+        good = np.abs(distance - target) < 0.1 * target
+        first = attempt == 0
+        origins[ids[good | first]], directions[ids[good | first]] = o[good | first], d[good | first]
+        missing[ids[good]] = False
+        if not missing.any():
+            break
+    return VertexRays(origins, directions, missing)
+
+
+def _merged(scene: mi.Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Concatenate all meshes: vertices (n_v, 3) and triangles (n_t, 3) with global indices."""
+    vertices, triangles, offset = [], [], 0
+    for shape in scene.shapes():
+        vertices.append(shape.vertex_positions_buffer().numpy().reshape(-1, 3))
+        triangles.append(shape.faces_buffer().numpy().reshape(-1, 3).astype(np.int64) + offset)
+        offset += len(vertices[-1])
+    return np.concatenate(vertices), np.concatenate(triangles)
+
+
+def _triangles_of_vertices(
+    vertices: NDArray[np.float32], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """List every corner with its vertex and its rank there: the corner with the widest room (2 area / longest edge)
+    of each vertex has rank 0."""
+    p = vertices[triangles].astype(np.float64)  # [triangle, corner, xyz]
+    edges = np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2)  # [triangle, edge]
+    room = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1) / edges.max(axis=1)
+    owners = triangles.reshape(-1)
+    corners = np.arange(len(owners))
+    order = np.lexsort((-np.repeat(room, 3), owners))
+    owners, corners = owners[order], corners[order]
+    first = np.searchsorted(owners, owners)  # index of each vertex's first corner
+    return owners, np.arange(len(owners)) - first, corners
+
+
+def _approach(
+    vertices: NDArray[np.float32],
+    triangles: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    step: float,
+    height: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """Rays that come down on triangles near given corners: origins, directions, and the distance they should go."""
+    face, corner = corners // 3, corners % 3
+    p = vertices[triangles[face]].astype(np.float64)  # [ray, corner, xyz]
+    here = p[np.arange(len(p)), corner]
+    target = here + step * (p.mean(axis=1) - here)
+    normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    origin = (target + height * normal).astype(np.float32)
+    return origin, (-normal).astype(np.float32), np.full(len(p), height)
+
+
+def sensor_points(scene: Scene, rays: VertexRays | None = None) -> Points:
+    """Return the points that the ``mesh_vertices`` sensor really sees: its own hits, with Mitsuba's normals there.
+
+    Parameters
+    ----------
+    scene : Scene
+    rays : VertexRays, optional
+        Of ``scene.normalised``; made here if not given.
+    """
+    rays = rays or vertex_rays(scene.normalised)
+    ray = mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
+    si = scene.normalised.ray_intersect(ray)
+    dr.eval(si)
+    as_rows = [np.ascontiguousarray(a.numpy().T) for a in (si.p, si.sh_frame.n, si.n)]
+    return Points(as_rows[0], as_rows[1], as_rows[2], scene.vertex_keys)

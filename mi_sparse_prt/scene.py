@@ -1,0 +1,626 @@
+"""From a Mitsuba scene to vertices: positions, normals, albedo, triangles, and a copy in the unit box.
+
+The rooms behind this one never look at Mitsuba shapes. What they get is a `Scene`: clean triangle meshes whose
+vertices are the rows of the light transport matrix, and two Mitsuba scenes with exactly these meshes, one where
+the user put them, one scaled to the unit box, where Mitsuba's absolute ray offsets mean the same for every scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from . import tessellation
+from .errors import PrtError, PrtWarning
+from .tessellation import TriangleMesh
+
+#: More vertices than this are refused: the matrix of 6144 directions would need 4 GB of visibility bits alone.
+MAX_VERTICES = 5_000_000
+
+#: The default edge length is the diagonal of the scene's box divided by this.
+EDGES_PER_DIAGONAL = 64
+
+#: Samples per vertex for the directional albedo of a BSDF that is not diffuse (stratified, 8 x 8).
+ALBEDO_STRATA = 8
+
+PARAMETRIC = {"Sphere": "sphere", "Disk": "disk", "Cylinder": "cylinder"}
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """One mesh of a `Scene`.
+
+    Attributes
+    ----------
+    name : str
+        The shape's id, unique in the scene.
+    vertices : slice
+        Its vertices among the scene's.
+    triangles : (n_t, 3) int32
+        Indices local to the slice: the scene's vertex is ``vertices.start + index``.
+    """
+
+    name: str
+    vertices: slice
+    triangles: NDArray[np.int32]
+
+
+class Scene:
+    """Vertices to compute transport for, and the Mitsuba scenes to compute it in.
+
+    Made by `load_scene` or `Scene.from_mitsuba`. All arrays are C-contiguous float32.
+
+    Attributes
+    ----------
+    positions, normals : (n_v, 3) float32
+        World space; normals are unit shading normals, one per vertex, as Mitsuba shades with.
+    albedo : (n_v, 3) float32
+        Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal incidence.
+    meshes : tuple of Mesh
+    mitsuba : mi.Scene
+        World space: the meshes of `meshes`, in that order and with these vertices, plus the sensors, emitters and
+        integrator of the original scene (the same objects).
+    normalised : mi.Scene
+        The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters, no sensors.
+    centre : (3,) float64
+    scale : float
+        normalised = (world - centre) * scale, computed in float64. A scene that was scaled gives the same
+        normalised positions within 1e-6; one moved by k times its size within k * 6e-8, which is what its float32
+        world positions still know.
+    normalised_positions : (n_v, 3) float32
+    warnings : list of str
+        What was handled on the user's behalf; each was also issued as a `PrtWarning`.
+    path : str or None
+        The XML file.
+    """
+
+    def __init__(self, mitsuba: mi.Scene, meshes: list[TriangleMesh], materials: list[Material]) -> None:
+        """Use `Scene.from_mitsuba`; `meshes` are clean and in world space, `materials` one for each."""
+        self.path: str | None = None
+        self.warnings: list[str] = []
+        self.meshes = tuple(
+            Mesh(mesh.name, slice(end - len(mesh.positions), end), mesh.triangles)
+            for mesh, end in zip(meshes, np.cumsum([len(m.positions) for m in meshes]).tolist(), strict=True)
+        )
+        self.positions = np.concatenate([m.positions for m in meshes])
+        self.normals = np.concatenate([m.normals for m in meshes])
+
+        low, high = (
+            self.positions.min(axis=0).astype(np.float64),
+            self.positions.max(axis=0).astype(np.float64),
+        )
+        self.centre: NDArray[np.float64] = (low + high) / 2
+        self.scale = float(1 / np.max(high - low))
+        self.normalised_positions = ((self.positions.astype(np.float64) - self.centre) * self.scale).astype(
+            np.float32
+        )
+        world = [_mitsuba_mesh(m, k.bsdf, k.emission()) for m, k in zip(meshes, materials, strict=True)]
+        unit = [
+            _mitsuba_mesh(m, k.bsdf, positions=self.normalised_positions[view.vertices])
+            for m, k, view in zip(meshes, materials, self.meshes, strict=True)
+        ]
+        self.mitsuba: mi.Scene = _mitsuba_scene(world, self.meshes, mitsuba)
+        self.normalised: mi.Scene = _mitsuba_scene(unit, self.meshes)
+        self.albedo = np.concatenate(
+            [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
+        )
+        self._surfaces = meshes
+        self._materials = materials
+
+    @classmethod
+    def from_mitsuba(cls, scene: mi.Scene, edge_length: float | None = None) -> Scene:
+        """The `Scene` of a loaded Mitsuba scene, merged by Mitsuba or not.
+
+        Parameters
+        ----------
+        scene : mi.Scene
+            Meshes, spheres, disks and cylinders; its sensors, emitters and integrator are reused, not copied.
+        edge_length : float, optional
+            World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of the
+            scene's box / 64. `float("inf")` leaves meshes as they are.
+
+        Raises
+        ------
+        PrtError
+            No mesh; a shape that is no surface of triangles (instances, curves, grids); positions or normals that
+            are not finite; an albedo outside [0, 1]; more than 5 million vertices.
+        """
+        result = cls._build(scene, edge_length)
+        result._warn()
+        return result
+
+    @classmethod
+    def _build(cls, scene: mi.Scene, edge_length: float | None) -> Scene:
+        if not mi.is_rgb or not dr.is_jit_v(mi.Float):
+            raise PrtError(f"variant {mi.variant()} is not supported: use llvm_ad_rgb or cuda_ad_rgb")
+        if edge_length is not None and not edge_length > 0:
+            raise PrtError(f"edge_length must be positive (or inf), not {edge_length}")
+        shapes = scene.shapes()
+        if not shapes:
+            raise PrtError("the scene has no mesh: add at least one shape")
+        notes: list[str] = []
+        materials = [Material(shape, name, notes) for shape, name in zip(shapes, _names(shapes), strict=True)]
+        clean = [
+            _clean_mesh(s, m.name, notes) if s.is_mesh() else None
+            for s, m in zip(shapes, materials, strict=True)
+        ]
+        if edge_length is None:
+            edge_length = _diagonal(shapes, clean) / EDGES_PER_DIAGONAL
+
+        meshes: list[TriangleMesh] = []
+        for shape, mesh, material in zip(shapes, clean, materials, strict=True):
+            limit = MAX_VERTICES - sum(len(m.positions) for m in meshes)
+            mesh = _parametric(shape, material, edge_length, limit) if mesh is None else mesh
+            if material.one_sided and len(mesh.triangles) and tessellation.faces_inwards(mesh):
+                notes.append(
+                    f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
+                    "(set flip_normals, or use a twosided BSDF, if that is not meant)"
+                )
+            if shape.is_mesh():
+                mesh = tessellation.subdivide(mesh, edge_length, limit)
+            meshes.append(mesh)
+        used = [k for k, mesh in enumerate(meshes) if len(mesh.triangles)]
+        if not used:
+            raise PrtError("the scene has no triangle with an area: nothing to compute transport for")
+        result = cls(scene, [meshes[k] for k in used], [materials[k] for k in used])
+        result.warnings = notes
+        return result
+
+    def _warn(self) -> None:
+        for sentence in self.warnings:
+            warnings.warn(sentence, PrtWarning, stacklevel=3)
+
+    @property
+    def n_vertices(self) -> int:
+        """The number of vertices, which is the number of rows of the matrix."""
+        return len(self.positions)
+
+    @property
+    def diffuse(self) -> bool:
+        """Whether all BSDFs reflect purely diffusely."""
+        return all(material.diffuse for material in self._materials)
+
+    @cached_property
+    def grey(self) -> bool:
+        """Whether all surfaces provably reflect the three channels alike (within 1e-6)."""
+        even = np.max(np.ptp(self.albedo, axis=1)) <= 1e-6
+        return bool(even) and all(
+            k.grey(mesh) for k, mesh in zip(self._materials, self._surfaces, strict=True)
+        )
+
+    @cached_property
+    def vertex_keys(self) -> NDArray[np.uint64]:
+        """(n_v,) hash of each vertex's position, normal and albedo bits, whatever mesh and order it came in."""
+        return _hash_rows(np.concatenate([self.positions, self.normals, self.albedo], axis=1))
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 (hex) of the geometry and materials, independent of the order of shapes, vertices and triangles.
+
+        Merging meshes of one material does not change it; moving a vertex, or changing an albedo, a texture or any
+        parameter that a BSDF shows, does.
+        """
+        total = np.zeros(2, np.uint64)
+        digests = set()
+        for view, mesh, material in zip(self.meshes, self._surfaces, self._materials, strict=True):
+            digest = material.digest()
+            digests.add(digest)
+            seed = np.frombuffer(digest[:8], np.uint64)[0]
+            keys = _triangle_keys(mesh, self.vertex_keys[view.vertices], seed)
+            with np.errstate(over="ignore"):
+                total[0] += np.sum(_mix(keys), dtype=np.uint64)
+                total[1] += np.sum(_mix(keys ^ np.uint64(0x5851F42D4C957F2D)), dtype=np.uint64)
+        count = sum(len(mesh.triangles) for mesh in self.meshes)
+        parts = [total.tobytes(), str(count).encode(), *sorted(digests)]
+        return hashlib.sha256(b"|".join(parts)).hexdigest()
+
+    def __repr__(self) -> str:
+        names = ", ".join(f"{m.name} {m.vertices.stop - m.vertices.start}" for m in self.meshes)
+        return f"Scene({self.n_vertices} vertices: {names})"
+
+
+def load_scene(path: str | Path, edge_length: float | None = None, **parameters: Any) -> Scene:
+    """Load a Mitsuba XML scene.
+
+    Parameters
+    ----------
+    path : str or Path
+        The XML file; file names inside are relative to it.
+    edge_length : float, optional
+        World units; see `Scene.from_mitsuba`.
+    **parameters
+        Values for the XML's ``<default name=...>`` entries, as Mitsuba's ``-D`` gives them.
+
+    Raises
+    ------
+    PrtError
+        Missing file, XML or plugin error, and everything that `Scene.from_mitsuba` refuses.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PrtError(f"scene file {path} does not exist: check the path")
+    try:
+        loaded = mi.load_file(str(path), optimize=False, **{k: str(v) for k, v in parameters.items()})
+    except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others, over many lines
+        raise PrtError(f"scene file {path} cannot be loaded: {_one_line(error)}") from error
+    if not isinstance(loaded, mi.Scene):
+        raise PrtError(f"scene file {path} holds a {type(loaded).__name__}: its root element must be <scene>")
+    try:
+        scene = Scene._build(loaded, edge_length)
+    except PrtError as error:
+        raise PrtError(f"scene file {path}: {error}") from error
+    scene.path = str(path)
+    scene._warn()
+    return scene
+
+
+def _one_line(error: Exception, limit: int = 400) -> str:
+    """A Mitsuba error without its line breaks, source positions and colours."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+# ------------------------------------------------------------------------------------------- materials
+
+
+class Material:
+    """A shape's BSDF, and what can be said about it.
+
+    Attributes
+    ----------
+    name : str
+        The shape's name, for messages.
+    bsdf : mi.BSDF
+    diffuse : bool
+        It reflects diffusely and does nothing else.
+    one_sided : bool
+        It is black from behind.
+    constant : bool
+        It certainly does not vary over the surface nor with its rotation.
+    """
+
+    #: BSDFs and textures whose `mi.traverse` shows every colour that they have.
+    SHOWN = frozenset(
+        "SmoothDiffuse TwoSided BlendBSDF Mask Null SmoothPlastic RoughPlastic SmoothDielectric RoughDielectric "
+        "ThinDielectric SmoothConductor RoughConductor UniformSpectrum SRGBReflectanceSpectrum "
+        "BitmapTexture Checkerboard MeshAttribute Transform".split()
+    )
+    PLAIN = frozenset("SmoothDiffuse TwoSided UniformSpectrum SRGBReflectanceSpectrum".split())
+    BUMPED = frozenset("NormalMap BumpMap".split())
+
+    def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
+        self.name = name
+        self.bsdf: mi.BSDF = shape.bsdf()
+        self._emitter = shape.emitter() if shape.is_emitter() else None
+        self._text = str(self.bsdf)
+        # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
+        self._classes = {self.bsdf.class_name(), *re.findall(r"\b([A-Z]\w*)\[", self._text)}
+        flags = int(self.bsdf.flags())
+        scatter = flags & int(mi.BSDFFlags.All)
+        self.one_sided = not flags & int(mi.BSDFFlags.BackSide)
+        bumped = bool(self._classes & self.BUMPED)
+        self._lambertian = scatter == int(mi.BSDFFlags.DiffuseReflection)
+        self.diffuse = self._lambertian and not bumped
+        self.constant = self._classes <= self.PLAIN
+        if not self.diffuse:
+            what = "bends the shading normals" if self._lambertian else "is not diffuse"
+            notes.append(
+                f"shape '{name}': BSDF {self.bsdf.class_name()} {what}; its vertices are treated as diffuse with "
+                "the same reflectance, indirect paths use the real BSDF"
+            )
+        if self._emitter is not None:
+            notes.append(f"shape '{name}' is an area emitter: it does not take part in the transport matrix")
+        if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+            notes.append(
+                f"shape '{name}' bounds a medium: media are left out, light passes as through a vacuum"
+            )
+
+    def emission(self) -> mi.Emitter | None:
+        """A copy of the shape's area emitter for another shape; None if it has none or a textured one."""
+        if self._emitter is None:
+            return None
+        values = mi.traverse(self._emitter)
+        if "radiance.value" not in values:
+            return None
+        radiance = np.ravel(values["radiance.value"]).astype(float)
+        spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
+        return mi.load_dict({"type": "area", "radiance": spectrum})
+
+    def albedo(self, shape: mi.Mesh, mesh: TriangleMesh) -> NDArray[np.float32]:
+        """(n, 3) reflectance at the vertices of `mesh`, evaluated by Mitsuba on its twin `shape`.
+
+        Each vertex is looked at in the corner of one of its triangles, from the direction of its normal.
+        """
+        n = len(mesh.positions)
+        corner_of = np.zeros(n, np.int64)  # [vertex] -> index into the flattened triangles
+        flat = mesh.triangles.ravel()
+        corner_of[flat[::-1]] = np.arange(len(flat))[::-1]
+        triangle, corner = np.divmod(corner_of, 3)
+
+        pi = dr.zeros(mi.PreliminaryIntersection3f, n)
+        pi.prim_index = mi.UInt32(triangle.astype(np.uint32))
+        pi.prim_uv = mi.Point2f(
+            mi.Float((corner == 1).astype(np.float32)), mi.Float((corner == 2).astype(np.float32))
+        )
+        pi.shape = mi.ShapePtr(shape)
+        pi.t = mi.Float(1.0)
+        ray = dr.zeros(mi.Ray3f, n)
+        si = shape.compute_surface_interaction(ray, pi)
+        si.t = mi.Float(1.0)
+        si.wi = mi.Vector3f(0, 0, 1)
+        value = self.bsdf.eval_diffuse_reflectance(si) if self._lambertian else self._directional_albedo(si)
+        albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
+        bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
+        if bad.size:
+            raise PrtError(
+                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} ({bad.size} such "
+                "vertices): reflectance must lie in 0..1"
+            )
+        return np.ascontiguousarray(np.minimum(albedo, 1))
+
+    def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
+        """The share of light from the normal's direction that is scattered: the mean of stratified BSDF samples."""
+        context = mi.BSDFContext()
+        total = dr.zeros(mi.Color3f, dr.width(si))
+        n = ALBEDO_STRATA
+        for k in range(n * n):
+            # The lobe's number runs through all strata in bit-reversed order, so that each lobe sees the whole square.
+            lobe = mi.Float(dr.opaque(mi.Float, (_radical_inverse(k) + 0.5 / (n * n)) % 1))
+            u = mi.Point2f(dr.opaque(mi.Float, (k % n + 0.5) / n), dr.opaque(mi.Float, (k // n + 0.5) / n))
+            _, weight = self.bsdf.sample(context, si, lobe, u)
+            total += mi.Color3f(weight)
+            dr.eval(total)
+        return dr.clip(total / (n * n), 0, 1)
+
+    def grey(self, mesh: TriangleMesh) -> bool:
+        """Whether the BSDF provably reflects the three channels alike."""
+        if not self._classes <= self.SHOWN:
+            return False
+        if "MeshAttribute" in self._classes and not all(
+            _even(values) for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
+        ):
+            return False
+        parameters = mi.traverse(self.bsdf)
+        return all(_even(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
+
+    def digest(self) -> bytes:
+        """SHA-256 of the BSDF's description and of all parameters that `mi.traverse` shows, bitmaps included."""
+        state = hashlib.sha256(self._text.encode())
+        parameters = mi.traverse(self.bsdf)
+        for name in sorted(parameters.keys()):
+            value = parameters[name]
+            state.update(name.encode())
+            state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
+        return state.digest()
+
+
+def _even(value: Any) -> bool:
+    """Whether colours, a `mi.Color3f` or [..., channel], have three equal channels; other things always do."""
+    values = np.array(value, np.float64)
+    if isinstance(value, mi.Color3f):
+        values = values.T  # [1, channel]
+    if values.ndim < 2 or values.shape[-1] not in (3, 4):
+        return True
+    return bool(np.all(np.ptp(values[..., :3], axis=-1) <= 1e-6))
+
+
+def _radical_inverse(k: int, bits: int = 6) -> float:
+    return int(f"{k:0{bits}b}"[::-1], 2) / 2**bits
+
+
+# --------------------------------------------------------------------------------- shapes to triangles
+
+
+def _names(shapes: list[mi.Shape]) -> list[str]:
+    """A unique name for each shape: its id, else the name of its file, else its type and number."""
+    names: list[str] = ["type"]  # a reserved word in Mitsuba's dictionaries
+    for k, shape in enumerate(shapes):
+        name = shape.id()
+        if not name or name.startswith("_"):
+            file = re.search(r'name = "([^"]+)"', str(shape)) if shape.is_mesh() else None
+            name = Path(file.group(1)).stem if file else f"{shape.class_name().lower()}_{k}"
+        name = re.sub(r"[.\s/]", "_", name)
+        unique, suffix = name, 2
+        while unique in names:
+            unique, suffix = f"{name}_{suffix}", suffix + 1
+        names.append(unique)
+    return names[1:]
+
+
+def _diagonal(shapes: list[mi.Shape], clean: list[TriangleMesh | None]) -> float:
+    """The diagonal of the box around all shapes, in which unused vertices do not count."""
+    points: list[NDArray] = []
+    for shape, mesh in zip(shapes, clean, strict=True):
+        if mesh is None:
+            box = shape.bbox()
+            points += [np.array(box.min).reshape(1, 3), np.array(box.max).reshape(1, 3)]
+        else:
+            points.append(mesh.positions)
+    return float(np.linalg.norm(np.ptp(np.concatenate(points).astype(np.float64), axis=0)))
+
+
+def _parametric(shape: mi.Shape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
+    """The grid of a sphere, disk or cylinder, in world space; every other shape is refused."""
+    kind = PARAMETRIC.get(shape.class_name())
+    if kind is None:
+        raise PrtError(
+            f"shape '{material.name}' is of type {shape.class_name()}, which is not made of triangles: "
+            "replace it by a mesh (ply, obj), an instance by a copy of its shapes"
+        )
+    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    return tessellation.parametric_mesh(
+        kind,
+        to_world,
+        edge_length,
+        material.name,
+        limit=limit,
+        flip=shape.has_flipped_normals(),
+        weld=material.constant,
+    )
+
+
+def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
+    """A Mitsuba mesh as clean triangles in world space, with the normals that Mitsuba shades with."""
+    mesh = _read(shape, name)
+    tessellation.check_geometry(mesh)
+    if mesh.normals is not None:
+        mesh = tessellation.settle_normals(mesh, _recomputed_normals(mesh))
+    mesh, dropped = tessellation.drop_degenerate(mesh)
+    if dropped:
+        notes.append(f"shape '{name}': {dropped} triangles without area are left out")
+    mesh, dropped = tessellation.drop_unreferenced(mesh)
+    if dropped:
+        notes.append(f"shape '{name}': {dropped} vertices that no triangle uses are left out")
+    if mesh.normals is None:  # Mitsuba shades such meshes flat
+        mesh = tessellation.split_by_face(mesh)
+    mesh, zero = tessellation.with_unit_normals(mesh)
+    if zero:
+        notes.append(
+            f"shape '{name}': {zero} vertices have a normal of length zero; it is computed from their faces"
+        )
+    return tessellation.flipped(mesh) if shape.has_flipped_normals() else mesh
+
+
+def _recomputed_normals(mesh: TriangleMesh) -> NDArray[np.float32]:
+    """(n, 3) normals as Mitsuba computes them for files that have none."""
+    scratch = mi.Mesh(mesh.name, len(mesh.positions), len(mesh.triangles), has_vertex_normals=True)
+    parameters = mi.traverse(scratch)
+    parameters["faces"] = mi.UInt32(mesh.triangles.astype(np.uint32).ravel())
+    parameters["vertex_positions"] = mi.Float(mesh.positions.ravel())
+    parameters.update()
+    return np.array(scratch.vertex_normals_buffer(), np.float32).reshape(-1, 3)
+
+
+def _read(shape: mi.Mesh, name: str) -> TriangleMesh:
+    """The buffers of a Mitsuba mesh as NumPy copies."""
+
+    def rows(buffer: Any, width: int, dtype: type) -> NDArray:
+        return np.array(buffer, dtype=dtype).reshape(-1, width).copy()
+
+    n, t = shape.vertex_count(), shape.face_count()
+    vertex_attributes, face_attributes = {}, {}
+    for key in mi.traverse(shape).keys():
+        if key.startswith("vertex_") and key not in (
+            "vertex_positions",
+            "vertex_normals",
+            "vertex_texcoords",
+        ):
+            vertex_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(n, -1)
+        elif key.startswith("face_"):
+            face_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(t, -1)
+    return TriangleMesh(
+        name,
+        rows(shape.vertex_positions_buffer(), 3, np.float32),
+        rows(shape.vertex_normals_buffer(), 3, np.float32)
+        if shape.has_vertex_normals() and not shape.has_face_normals()
+        else None,
+        rows(shape.faces_buffer(), 3, np.uint32).astype(np.int32),
+        rows(shape.vertex_texcoords_buffer(), 2, np.float32) if shape.has_vertex_texcoords() else None,
+        vertex_attributes,
+        face_attributes,
+    )
+
+
+def _mitsuba_mesh(
+    mesh: TriangleMesh,
+    bsdf: mi.BSDF,
+    emitter: mi.Emitter | None = None,
+    positions: NDArray[np.float32] | None = None,
+) -> mi.Mesh:
+    """A Mitsuba mesh of these triangles; `positions` replaces the mesh's own."""
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    if emitter is not None:
+        properties["emitter"] = emitter
+    assert mesh.normals is not None
+    result = mi.Mesh(
+        mesh.name,
+        vertex_count=len(mesh.positions),
+        face_count=len(mesh.triangles),
+        props=properties,
+        has_vertex_normals=True,
+        has_vertex_texcoords=mesh.texcoords is not None,
+    )
+    parameters = mi.traverse(result)
+    parameters["faces"] = mi.UInt32(mesh.triangles.astype(np.uint32).ravel())
+    # Dr.Jit shares NumPy's memory: the mesh gets its own.
+    parameters["vertex_positions"] = mi.Float(
+        (mesh.positions if positions is None else positions).ravel().copy()
+    )
+    if mesh.texcoords is not None:
+        parameters["vertex_texcoords"] = mi.Float(mesh.texcoords.ravel())
+    parameters.update()
+    # Mitsuba recomputes normals whenever positions change: set ours afterwards.
+    parameters["vertex_normals"] = mi.Float(mesh.normals.ravel())
+    parameters.update()
+    for key, values in (*mesh.vertex_attributes.items(), *mesh.face_attributes.items()):
+        result.add_attribute(key, values.shape[1], values.ravel())
+    return result
+
+
+def _mitsuba_scene(
+    shapes: list[mi.Mesh], views: tuple[Mesh, ...], original: mi.Scene | None = None
+) -> mi.Scene:
+    """A Mitsuba scene of these meshes, in this order, with the original's sensors, emitters and integrator."""
+    content: dict[str, Any] = {"type": "scene"}
+    content.update({view.name: shape for view, shape in zip(views, shapes, strict=True)})
+    if original is not None:
+        on_shapes = [s.emitter() for s in original.shapes() if s.is_emitter()]
+        on_shapes += [s.sensor() for s in original.shapes() if s.is_sensor()]
+        others = [*original.sensors(), *original.emitters(), original.integrator()]
+        for k, thing in enumerate(t for t in others if t is not None and not any(t is s for s in on_shapes)):
+            key = thing.id()
+            content[key if key and "." not in key and key not in content else f"_other_{k}"] = thing
+    return mi.load_dict(content, optimize=False)
+
+
+# ----------------------------------------------------------------------------------------------- hashes
+
+
+def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """SplitMix64's finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words that scatters all bits."""
+    with np.errstate(over="ignore"):
+        x = x + np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return x ^ (x >> np.uint64(31))
+
+
+def _hash_rows(values: NDArray[np.float32], seed: NDArray[np.uint64] | int = 0) -> NDArray[np.uint64]:
+    """(n,) hash of the bits of each row of (n, k) float32; -0 counts as 0."""
+    bits = (np.ascontiguousarray(values, np.float32) + np.float32(0)).view(np.uint32)  # [row, column]
+    state = np.zeros(len(bits), np.uint64) + np.asarray(seed, np.uint64)
+    for column in bits.T:
+        state = _mix(state ^ column)
+    return state
+
+
+def _triangle_keys(
+    mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64
+) -> NDArray[np.uint64]:
+    """(t,) hash of each triangle: its corners, from the one of smallest key on, and its material (`seed`)."""
+    corners = vertex_keys
+    if mesh.texcoords is not None:
+        corners = _hash_rows(mesh.texcoords, corners)
+    for _, values in sorted(mesh.vertex_attributes.items()):
+        corners = _hash_rows(values, corners)
+    keys = corners[mesh.triangles]  # [triangle, corner]
+    order = (np.argmin(keys, axis=1)[:, None] + np.arange(3)) % 3
+    state = np.full(len(keys), seed)
+    for corner in np.take_along_axis(keys, order, axis=1).T:
+        state = _mix(state ^ corner)
+    for _, values in sorted(mesh.face_attributes.items()):
+        state = _hash_rows(values, state)
+    return state

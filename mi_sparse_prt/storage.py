@@ -1,0 +1,179 @@
+"""Matrices on disk: one Zarr v3 hierarchy in one zip file, chunked by blocks of vertices.
+
+Every chunk carries a checksum (the zip's CRC-32), so a truncated or altered file is refused. Files are written under
+a temporary name beside the target and renamed when complete.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import zarr
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+
+FORMAT = "mi_sparse_prt light transport matrix"
+VERSION = 1
+_VERTEX_CHUNK = 4096
+
+
+def save(transport: LightTransport, path: str | Path) -> None:
+    """Write a matrix to a file; an interrupted or failed write leaves nothing under the name.
+
+    Parameters
+    ----------
+    transport : LightTransport
+    path : path
+        By convention ``*.prt``.
+
+    Raises
+    ------
+    PrtError
+        If the folder does not exist or the file cannot be written (full disk, permissions).
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise PrtError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise PrtError(f"cannot write {path}: it is a folder; give a file name such as {path / 'scene.prt'}")
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        os.close(handle)
+        _write(transport, temporary)
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+        temporary = None
+    except OSError as error:
+        raise PrtError(
+            f"cannot write {path}: {error.strerror or error}; nothing was left behind, free some space or choose another folder"
+        ) from None
+    finally:
+        if temporary:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
+    """Read a matrix from a file.
+
+    Parameters
+    ----------
+    path : path
+    scene : Scene, optional
+        The scene it should belong to; a matrix of another scene is refused. Rows come in this scene's vertex order.
+
+    Raises
+    ------
+    PrtError
+        If the file is missing, no matrix, truncated, altered, of a newer format, or of another scene.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PrtError(f"no such matrix file: {path}; make it with `mi-sparse-prt precompute SCENE -o {path}`")
+    broken = f"{path} is damaged or not a matrix file of mi_sparse_prt; precompute it again"
+    try:
+        store = zarr.storage.ZipStore(path, mode="r")
+        try:
+            group = zarr.open_group(store, mode="r")
+            attributes = dict(group.attrs)
+            if attributes.get("format") != FORMAT:
+                raise PrtError(broken)
+            if attributes["version"] > VERSION:
+                raise PrtError(f"{path} was written by a newer mi_sparse_prt; upgrade the package to read it")
+            arrays = {name: _read(array) for name, array in group.arrays()}
+        finally:
+            store.close()
+        transport = _assemble(attributes, arrays)
+    except PrtError:
+        raise
+    except (OSError, zipfile.BadZipFile, zlib.error, KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise PrtError(f"{broken} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})") from None
+    return transport if scene is None else transport.for_scene(scene)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _write(transport: LightTransport, path: str) -> None:
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        "resolution": transport.lighting.resolution,
+        "basis": transport.basis,
+        "scene_hash": transport.scene_hash,
+        "meshes": [[m.name, m.vertices.start, m.vertices.stop] for m in transport.meshes],
+        "indirect": transport.indirect is not None,
+        "report": transport.report,
+    }
+    store = zarr.storage.ZipStore(path, mode="w")
+    try:
+        group = zarr.create_group(store, attributes=attributes)
+        for name, array in _arrays(transport).items():
+            chunks = (min(_VERTEX_CHUNK, max(1, len(array))), *array.shape[1:])
+            group.create_array(name, data=array, chunks=chunks, config={"write_empty_chunks": True})
+    finally:
+        store.close()
+
+
+def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {"albedo": transport.albedo, "vertex_keys": transport.vertex_keys}
+    if isinstance(transport.direct, Visibility):
+        arrays |= {"visibility": transport.direct.bits, "normals": transport.direct.normals}
+    else:
+        arrays["mean_cosine"] = transport.direct.fixed
+    if transport.indirect is not None:
+        upsampling = transport.indirect.upsampling
+        arrays |= {
+            "indirect": transport.indirect.density,
+            "upsampling_data": upsampling.data,
+            "upsampling_indices": upsampling.indices,
+            "upsampling_indptr": upsampling.indptr,
+        }
+    return arrays
+
+
+def _read(array: Any) -> NDArray[Any]:
+    if array.nchunks_initialized != array.nchunks:
+        raise ValueError(f"{array.nchunks - array.nchunks_initialized} chunks are missing")
+    return np.asarray(array[...])
+
+
+def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
+    lighting = CubemapLighting(attributes["resolution"])
+    direct: Visibility | MeanCosine
+    if attributes["basis"] == "direction":
+        direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
+    else:
+        direct = MeanCosine(arrays["mean_cosine"], lighting)
+    indirect = None
+    if attributes["indirect"]:
+        density = arrays["indirect"]
+        upsampling = scipy.sparse.csr_array(
+            (arrays["upsampling_data"], arrays["upsampling_indices"], arrays["upsampling_indptr"]),
+            shape=(lighting.n_directions, density.shape[1]),
+        )
+        indirect = Indirect(density, upsampling, lighting)
+    return LightTransport(
+        lighting=lighting,
+        basis=attributes["basis"],
+        albedo=arrays["albedo"],
+        direct=direct,
+        indirect=indirect,
+        meshes=tuple(MeshRange(name, slice(a, b)) for name, a, b in attributes["meshes"]),
+        vertex_keys=arrays["vertex_keys"],
+        scene_hash=attributes["scene_hash"],
+        report=attributes["report"],
+    )

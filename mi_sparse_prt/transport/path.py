@@ -1,0 +1,226 @@
+"""S_i by path tracing: interreflected light, one independent estimate per element ([Leh07] eq. 12 with T - V apart).
+
+Every element is a small Monte Carlo problem of its own: paths start at its point, and each surface they meet is lit
+by its texel through one shadow ray. Nothing about the surfaces is assumed; they are asked through Mitsuba's BSDF
+interface. The estimates of different elements are independent, which later statistics rely on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.transport.lanes import PointArrays, TexelArrays, random_generator, start_ray
+
+LANES = 1 << 22  # paths per wavefront, about half a second each
+ROULETTE_DEPTH = 5  # bounces before Russian roulette starts, as Mitsuba's ``path`` has it
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean of an element's samples, and the variance of that mean, each (n, channels) float32."""
+
+    mean: NDArray[np.float32]
+    variance: NDArray[np.float32]
+
+
+class PathTransport:
+    """Indirect light at points of a scene, one element per point and texel.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Normalised copy without emitters.
+    lighting : CubemapLighting
+    points : Points
+    basis : {"direction", "texel"}
+        Light from the texel's centre alone, or radiance 1 over the whole texel.
+    max_depth : int
+        As Mitsuba's ``path`` counts it for a ray that ends on the point: 3 = one interreflection, -1 = no limit.
+    spp : int
+        Paths per element.
+    channels : {1, 3}
+        1 in a grey scene: red stands for all.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        lighting: CubemapLighting,
+        points: Points,
+        basis: str = "direction",
+        max_depth: int = 5,
+        spp: int = 16,
+        channels: int = 3,
+        seed: int = 0,
+    ) -> None:
+        self.scene, self.lighting, self.points = scene, lighting, points
+        self.basis, self.max_depth, self.spp, self.channels, self.seed = basis, max_depth, spp, channels, seed
+        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
+
+    @property
+    def block_size(self) -> int:
+        """Rows whose paths fill one wavefront."""
+        return max(1, LANES // (self.lighting.n_directions * self.spp))
+
+    def any_hit(self, rays_per_point: int) -> bool:
+        """Whether any of a few cosine-distributed rays per point meets a surface."""
+        lane = dr.arange(mi.UInt32, len(self.points) * rays_per_point)
+        point = lane // rays_per_point
+        rng = random_generator(self._points.key(point), mi.UInt32(0), lane - point * rays_per_point, self.seed)
+        return bool(dr.any(self.scene.ray_test(self._first_ray(point, rng))))
+
+    def rows(self, point_ids: NDArray[np.integer]) -> Estimate:
+        """Whole rows: mean and variance (len(point_ids), n_directions, channels), see ``elements``."""
+        shape = (len(point_ids), self.lighting.n_directions, self.channels)
+        points = np.repeat(np.asarray(point_ids, dtype=np.uint32), self.lighting.n_directions)
+        texels = np.tile(np.arange(self.lighting.n_directions, dtype=np.uint32), len(point_ids))
+        estimate = self.elements(points, texels)
+        return Estimate(estimate.mean.reshape(shape), estimate.variance.reshape(shape))
+
+    def elements(
+        self,
+        point_ids: NDArray[np.integer],
+        texel_ids: NDArray[np.integer],
+        seed: int | None = None,
+    ) -> Estimate:
+        """White indirect transport per solid angle (the indirect T of albedo 1, divided by d_omega) of listed elements.
+
+        Parameters
+        ----------
+        point_ids, texel_ids : (n,) integers
+            Neighbouring elements should share the point: their rays are then coherent.
+        seed : int, optional
+            Another seed than the solver's gives independent estimates.
+
+        Returns
+        -------
+        Estimate
+            ``mean`` (n, channels) in 1/sr, and the variance of that mean.
+        """
+        mean = np.zeros((len(point_ids), self.channels), dtype=np.float32)
+        variance = np.zeros_like(mean)
+        seed = self.seed if seed is None else seed
+        size = max(1, LANES // self.spp)
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            block = self._estimate(mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part]), seed)
+            mean[part], variance[part] = block.mean, block.variance
+        return Estimate(mean, variance)
+
+    def _estimate(self, points: mi.UInt32, texels: mi.UInt32, seed: int) -> Estimate:
+        lane = dr.arange(mi.UInt32, len(points) * self.spp)
+        element = lane // self.spp
+        point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+        rng = random_generator(self._points.key(point), texel, lane - element * self.spp, seed)
+        radiance = self._radiance(point, texel, rng)
+        samples = [radiance[c] for c in range(self.channels)]
+        sums = [dr.block_reduce(dr.ReduceOp.Add, x, self.spp) for x in samples]
+        squares = [dr.block_reduce(dr.ReduceOp.Add, x * x, self.spp) for x in samples]
+        dr.eval(sums, squares)
+        mean = np.stack([x.numpy() for x in sums], axis=-1) / self.spp
+        second = np.stack([x.numpy() for x in squares], axis=-1) / self.spp
+        variance = np.maximum(second - mean**2, 0) / max(self.spp - 1, 1)
+        return Estimate(mean, variance)
+
+    def _first_ray(self, point: mi.UInt32, rng: mi.PCG32) -> mi.Ray3f:
+        """Cosine-distributed about the shading normal."""
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        return start_ray(self._points, point, mi.Frame3f(self._points.normal(point)).to_world(local))
+
+    def _radiance(self, point: mi.UInt32, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
+        """One sample of (1/pi) times the irradiance that reaches points by way of other surfaces, per d_omega.
+
+        Cosine-distributed first rays make that the mean of the radiance they find.
+        """
+        ray = self._first_ray(point, rng)
+        bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
+        if self.basis == "direction":
+            return _reflected(self.scene, ray, Light(self._texels.centre(texel), mi.Float(1)), rng, bounces)
+        # Radiance 1 over the texel: each path sees its own direction in it, weighted to 1 on average.
+        direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
+        mean = self._texels.solid_angle(texel)
+        light = Light(direction, solid_angle / mean)
+        if _has_mirrors(self.scene):
+            light = Light(direction, solid_angle / mean, lambda d: self._texels.contains(texel, d), 1 / mean)
+        return _reflected(self.scene, ray, light, rng, bounces)
+
+
+@dataclass
+class Light:
+    """The light of one element: irradiance (perpendicular) from one direction, for all surfaces but mirrors.
+
+    A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths that
+    leave the scene right after one collect ``radiance`` if they leave towards the light (``contains``).
+    """
+
+    direction: mi.Vector3f
+    irradiance: mi.Float
+    contains: Callable[[mi.Vector3f], mi.Mask] | None = None
+    radiance: mi.Float | None = None
+
+
+def _has_mirrors(scene: mi.Scene) -> bool:
+    """Whether any surface scatters into single directions."""
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes())
+
+
+@dr.syntax
+def _reflected(
+    scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
+) -> mi.Color3f:
+    """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
+
+    Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most.
+    """
+    context = mi.BSDFContext()
+    ray = mi.Ray3f(ray)
+    result, throughput = mi.Color3f(0), mi.Color3f(1)
+    depth = mi.UInt32(0)
+    mirrored = mi.Mask(False)
+    active = mi.Mask(depth < bounces)
+    while active:
+        si = scene.ray_intersect(ray, active)
+        if light.contains is not None:
+            escaped = active & mirrored & ~si.is_valid()
+            result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
+        active &= si.is_valid() & (depth < bounces)
+
+        # Light from its one direction
+        bsdf = si.bsdf(ray)
+        value, _, sample, weight = bsdf.eval_pdf_sample(
+            context,
+            si,
+            si.to_local(light.direction),
+            rng.next_float32(),
+            mi.Point2f(rng.next_float32(), rng.next_float32()),
+            active,
+        )
+        lit = active & dr.any(value > 0)
+        lit &= ~scene.ray_test(si.spawn_ray(light.direction), lit)
+        result += dr.select(lit, throughput * value * light.irradiance, 0)
+
+        # Next surface
+        depth += 1
+        throughput *= weight
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        active &= dr.any(throughput != 0)
+        if light.contains is None:
+            active &= depth < bounces
+        else:  # one more ray after the last mirror, to see the light itself
+            active &= (depth < bounces) | mirrored & (depth == bounces)
+
+        # Russian roulette
+        survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(throughput), 0.95), 1)
+        active &= rng.next_float32() < survival
+        throughput /= survival
+    return result

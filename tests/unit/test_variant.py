@@ -1,0 +1,139 @@
+"""The choice of the variant: on stand-ins for Mitsuba and Dr.Jit, and for real in processes of their own."""
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from mi_sparse_prt import PrtError
+
+variant = importlib.import_module("mi_sparse_prt.variant")  # the package's own `variant` is the function
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Returns a function that replaces Mitsuba and Dr.Jit by those of a machine with the given traits."""
+
+    def make(current=None, cuda=False, optix=True, llvm=(19, 1, 7), forced=None):
+        state = SimpleNamespace(current=current)
+        mitsuba = SimpleNamespace(
+            variant=lambda: state.current, set_variant=lambda name: setattr(state, "current", name)
+        )
+        drjit = SimpleNamespace(
+            JitBackend=SimpleNamespace(CUDA="cuda", LLVM="llvm"),
+            has_backend=lambda backend: cuda if backend == "cuda" else llvm is not None,
+            detail=SimpleNamespace(llvm_version=lambda: llvm),
+        )
+        monkeypatch.setitem(sys.modules, "mitsuba", mitsuba)
+        monkeypatch.setitem(sys.modules, "drjit", drjit)
+        monkeypatch.setenv("DRJIT_LIBOPTIX_PATH", "libc.so.6" if optix else "/nowhere/libnvoptix.so.1")
+        monkeypatch.delenv("MI_SPARSE_PRT_VARIANT", raising=False)
+        monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+        if forced:
+            monkeypatch.setenv("MI_SPARSE_PRT_VARIANT", forced)
+        return state
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("traits", "expected"),
+    [
+        ({}, "llvm_ad_rgb"),
+        ({"cuda": True}, "cuda_ad_rgb"),
+        ({"cuda": True, "llvm": None}, "cuda_ad_rgb"),
+        ({"cuda": True, "optix": False}, "llvm_ad_rgb"),
+        ({"cuda": True, "current": "llvm_ad_rgb"}, "llvm_ad_rgb"),
+        ({"cuda": True, "forced": "llvm_ad_rgb"}, "llvm_ad_rgb"),
+        ({"current": "scalar_rgb", "forced": "llvm_ad_rgb"}, "llvm_ad_rgb"),
+        ({"llvm": (17, 0, 0)}, "llvm_ad_rgb"),
+    ],
+)
+def test_choice(machine, traits, expected):
+    state = machine(**traits)
+    assert variant.choose_variant() == expected
+    assert state.current == expected
+
+
+def test_the_argument_wins(machine):
+    state = machine(cuda=True, current="cuda_ad_rgb", forced="cuda_ad_rgb")
+    variant.choose_variant("llvm_ad_rgb")
+    assert state.current == "llvm_ad_rgb"
+
+
+@pytest.mark.parametrize(
+    ("traits", "message"),
+    [
+        ({"current": "scalar_rgb"}, r"'scalar_rgb' is not supported: .*set_variant\('llvm_ad_rgb'\)"),
+        ({"current": "llvm_ad_spectral"}, "'llvm_ad_spectral' is not supported"),
+        ({"forced": "cuda_ad_rgb"}, "no CUDA driver or GPU"),
+        ({"llvm": (16, 0, 6)}, "libLLVM 16.0.6 makes Dr.Jit abort.*apt-get install libllvm19$"),
+        ({"llvm": None}, "found no libLLVM: apt-get install libllvm19$"),
+        ({"current": "llvm_ad_rgb", "llvm": (14, 0, 6)}, "libLLVM 14.0.6"),
+    ],
+)
+def test_refusals_are_one_line(machine, monkeypatch, traits, message):
+    state = machine(**traits)
+    monkeypatch.setattr(variant, "newest_llvm", lambda: None)
+    with pytest.raises(PrtError, match=message) as refused:
+        variant.choose_variant()
+    assert "\n" not in str(refused.value)
+    assert state.current == traits.get("current")
+
+
+def test_newest_llvm_reads_versions_and_not_letters(tmp_path):
+    for name in ("libLLVM-9.so.1", "libLLVM-16.so.1", "libLLVM-C.so", "libLLVM-17.so.1", "libLLVM.so.19.1"):
+        (tmp_path / name).touch()
+    (tmp_path / "libLLVM-21.so").symlink_to(tmp_path / "removed")
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM-16.so.1")
+    assert variant.newest_llvm([tmp_path, tmp_path / "absent"]) == tmp_path / "libLLVM.so.19.1"
+
+
+def test_newest_llvm_refuses_those_that_abort(tmp_path):
+    for name in ("libLLVM-14.0.6.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1"):
+        (tmp_path / name).touch()
+    assert variant.newest_llvm([tmp_path]) is None
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    inherited = {
+        k: v for k, v in os.environ.items() if k not in ("DRJIT_LIBLLVM_PATH", "MI_SPARSE_PRT_VARIANT")
+    }
+    root = str(Path(__file__).parents[2])
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**inherited, "PYTHONPATH": root, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_the_chosen_llvm_compiles_the_kernel_that_aborts_old_ones():
+    done = run_python(
+        "import mi_sparse_prt as prt, mitsuba as mi, drjit as dr\n"
+        "print(prt.variant(), dr.max(mi.Float([1, 3, 2]))[0])",
+        MI_SPARSE_PRT_VARIANT="llvm_ad_rgb",
+    )
+    assert done.stdout.split() == ["llvm_ad_rgb", "3.0"], done.stderr
+
+
+def test_an_llvm_that_aborts_is_refused_before_it_can():
+    """Expected: an exception with the remedy and exit status 1, where Dr.Jit alone ends by SIGABRT."""
+    old = [p for p in Path("/usr/lib").glob("*-linux-gnu/libLLVM-1[456].so.1")]
+    if not old:
+        pytest.skip("no libLLVM 14, 15 or 16 on this machine")
+    done = run_python(
+        "import mi_sparse_prt, mitsuba as mi, drjit as dr\ndr.max(mi.Float([1, 3, 2]))[0]",
+        DRJIT_LIBLLVM_PATH=str(old[0]),
+        MI_SPARSE_PRT_VARIANT="llvm_ad_rgb",
+    )
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("mi_sparse_prt.errors.PrtError: libLLVM 1")
+    assert str(old[0]) in last
+    assert "export DRJIT_LIBLLVM_PATH" in last or "apt-get install libllvm19" in last
