@@ -22,6 +22,11 @@ from .matrix import LightTransport  # noqa: E402
 from .precompute import precompute  # noqa: E402
 from .scene import Scene, load_scene  # noqa: E402
 from .storage import load_transport  # noqa: E402
+from .relighting.image import render  # noqa: E402
+from .validation.validate import Validation, validate  # noqa: E402
+from .plugins import register as _register_plugins  # noqa: E402
+
+_register_plugins()
 
 __all__ = [
     "CubemapLighting",
@@ -30,10 +35,13 @@ __all__ = [
     "PrtError",
     "PrtWarning",
     "Scene",
+    "Validation",
     "__version__",
     "load_environment",
     "load_scene",
     "load_transport",
     "precompute",
+    "render",
+    "validate",
     "variant",
 ]

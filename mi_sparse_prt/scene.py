@@ -1,8 +1,9 @@
 """From a Mitsuba scene to vertices: positions, normals, albedo, triangles, and a copy in the unit box.
 
-The rooms behind this one never look at Mitsuba shapes. What they get is a `Scene`: clean triangle meshes whose
-vertices are the rows of the light transport matrix, and two Mitsuba scenes with exactly these meshes, one where
-the user put them, one scaled to the unit box, where Mitsuba's absolute ray offsets mean the same for every scene.
+The rooms behind this one never look at Mitsuba shapes. What they get is a `Scene`: clean triangle meshes
+whose vertices are the rows of the light transport matrix, and two Mitsuba scenes with exactly these meshes: one
+where the user put them, one scaled to the unit box, where Mitsuba's absolute ray offsets mean the same for
+every scene.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ from . import tessellation
 from .errors import PrtError, PrtWarning
 from .tessellation import TriangleMesh
 
-#: More vertices than this are refused: the matrix of 6144 directions would need 4 GB of visibility bits alone.
+#: More vertices than this are refused: 6144 directions would need 4 GB of visibility bits alone.
 MAX_VERTICES = 5_000_000
 
 #: The default edge length is the diagonal of the scene's box divided by this.
@@ -66,18 +66,21 @@ class Scene:
     positions, normals : (n_v, 3) float32
         World space; normals are unit shading normals, one per vertex, as Mitsuba shades with.
     albedo : (n_v, 3) float32
-        Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal incidence.
+        Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal
+        incidence.
     meshes : tuple of Mesh
     mitsuba : mi.Scene
-        World space: the meshes of `meshes`, in that order and with these vertices, plus the sensors, emitters and
-        integrator of the original scene (the same objects).
+        World space: the meshes of `meshes`, in that order and with these vertices, plus the sensors, emitters
+        and integrator of the original scene (the same objects; area emitters of one colour are copied, textured
+        ones left out).
     normalised : mi.Scene
-        The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters, no sensors.
+        The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
+        no sensors.
     centre : (3,) float64
     scale : float
         normalised = (world - centre) * scale, computed in float64. A scene that was scaled gives the same
-        normalised positions within 1e-6; one moved by k times its size within k * 6e-8, which is what its float32
-        world positions still know.
+        normalised positions within 1e-6; one moved by k times its size within k * 1e-7, which is what its
+        float32 world positions still know.
     normalised_positions : (n_v, 3) float32
     warnings : list of str
         What was handled on the user's behalf; each was also issued as a `PrtWarning`.
@@ -127,14 +130,14 @@ class Scene:
         scene : mi.Scene
             Meshes, spheres, disks and cylinders; its sensors, emitters and integrator are reused, not copied.
         edge_length : float, optional
-            World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of the
-            scene's box / 64. `float("inf")` leaves meshes as they are.
+            World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of
+            the scene's box / 64. `float("inf")` leaves meshes as they are.
 
         Raises
         ------
         PrtError
-            No mesh; a shape that is no surface of triangles (instances, curves, grids); positions or normals that
-            are not finite; an albedo outside [0, 1]; more than 5 million vertices.
+            No mesh; a shape that is no surface of triangles (instances, curves, grids); positions or normals
+            that are not finite; an albedo outside [0, 1]; more than 5 million vertices.
         """
         result = cls._build(scene, edge_length)
         result._warn()
@@ -201,15 +204,15 @@ class Scene:
 
     @cached_property
     def vertex_keys(self) -> NDArray[np.uint64]:
-        """(n_v,) hash of each vertex's position, normal and albedo bits, whatever mesh and order it came in."""
+        """(n_v,) hash of each vertex's position, normal and albedo bits, whatever its mesh and number."""
         return _hash_rows(np.concatenate([self.positions, self.normals, self.albedo], axis=1))
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 (hex) of the geometry and materials, independent of the order of shapes, vertices and triangles.
+        """SHA-256 (hex) of geometry and materials, whatever the order of shapes, vertices and triangles.
 
-        Merging meshes of one material does not change it; moving a vertex, or changing an albedo, a texture or any
-        parameter that a BSDF shows, does.
+        Merging meshes of one material does not change it; moving a vertex, or changing an albedo, a texture or
+        any parameter that a BSDF shows, does.
         """
         total = np.zeros(2, np.uint64)
         digests = set()
@@ -253,7 +256,8 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
     try:
         loaded = mi.load_file(str(path), optimize=False, **{k: str(v) for k, v in parameters.items()})
     except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others, over many lines
-        raise PrtError(f"scene file {path} cannot be loaded: {_one_line(error)}") from error
+        reason = _one_line(error).replace(f"{path} ", "")
+        raise PrtError(f"scene file {path} cannot be loaded: {reason}") from error
     if not isinstance(loaded, mi.Scene):
         raise PrtError(f"scene file {path} holds a {type(loaded).__name__}: its root element must be <scene>")
     try:
@@ -266,13 +270,25 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
 
 
 def _one_line(error: Exception, limit: int = 400) -> str:
-    """A Mitsuba error without its line breaks, source positions and colours."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    """A Mitsuba error without its line breaks, colours and places in Mitsuba's own source."""
+    text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.(cpp|h):\d+\] ", "", str(error))
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 # ------------------------------------------------------------------------------------------- materials
+
+
+#: BSDFs and textures that do not vary over the surface nor with its rotation.
+PLAIN = {"SmoothDiffuse", "TwoSided", "UniformSpectrum", "SRGBReflectanceSpectrum"}
+
+#: BSDFs and textures whose colours are all among the parameters that `mi.traverse` shows.
+SHOWN = PLAIN | {"BlendBSDF", "Mask", "Null", "SmoothPlastic", "RoughPlastic", "SmoothDielectric"}
+SHOWN |= {"RoughDielectric", "ThinDielectric", "SmoothConductor", "RoughConductor"}
+SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
+
+#: BSDFs that bend the shading normal of the one that they wrap.
+BUMPED = {"NormalMap", "BumpMap"}
 
 
 class Material:
@@ -291,34 +307,25 @@ class Material:
         It certainly does not vary over the surface nor with its rotation.
     """
 
-    #: BSDFs and textures whose `mi.traverse` shows every colour that they have.
-    SHOWN = frozenset(
-        "SmoothDiffuse TwoSided BlendBSDF Mask Null SmoothPlastic RoughPlastic SmoothDielectric RoughDielectric "
-        "ThinDielectric SmoothConductor RoughConductor UniformSpectrum SRGBReflectanceSpectrum "
-        "BitmapTexture Checkerboard MeshAttribute Transform".split()
-    )
-    PLAIN = frozenset("SmoothDiffuse TwoSided UniformSpectrum SRGBReflectanceSpectrum".split())
-    BUMPED = frozenset("NormalMap BumpMap".split())
-
     def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
         self.name = name
         self.bsdf: mi.BSDF = shape.bsdf()
         self._emitter = shape.emitter() if shape.is_emitter() else None
-        self._text = str(self.bsdf)
+        self._text = re.sub(r" at 0x[0-9a-f]+", "", str(self.bsdf))  # no addresses of Python plugins
         # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
-        self._classes = {self.bsdf.class_name(), *re.findall(r"\b([A-Z]\w*)\[", self._text)}
+        self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
         flags = int(self.bsdf.flags())
         scatter = flags & int(mi.BSDFFlags.All)
         self.one_sided = not flags & int(mi.BSDFFlags.BackSide)
-        bumped = bool(self._classes & self.BUMPED)
+        bumped = bool(self._classes & BUMPED)
         self._lambertian = scatter == int(mi.BSDFFlags.DiffuseReflection)
         self.diffuse = self._lambertian and not bumped
-        self.constant = self._classes <= self.PLAIN
+        self.constant = self._classes <= PLAIN
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {self.bsdf.class_name()} {what}; its vertices are treated as diffuse with "
-                "the same reflectance, indirect paths use the real BSDF"
+                f"shape '{name}': BSDF {self.bsdf.class_name()} {what}; its vertices are treated as diffuse "
+                "with the same reflectance, indirect paths use the real BSDF"
             )
         if self._emitter is not None:
             notes.append(f"shape '{name}' is an area emitter: it does not take part in the transport matrix")
@@ -365,20 +372,21 @@ class Material:
         bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
         if bad.size:
             raise PrtError(
-                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} ({bad.size} such "
-                "vertices): reflectance must lie in 0..1"
+                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} "
+                f"({bad.size} such vertices): reflectance must lie in 0..1"
             )
         return np.ascontiguousarray(np.minimum(albedo, 1))
 
     def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
-        """The share of light from the normal's direction that is scattered: the mean of stratified BSDF samples."""
+        """The share of light from the normal's direction that is scattered: a mean of stratified samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
         n = ALBEDO_STRATA
         for k in range(n * n):
-            # The lobe's number runs through all strata in bit-reversed order, so that each lobe sees the whole square.
-            lobe = mi.Float(dr.opaque(mi.Float, (_radical_inverse(k) + 0.5 / (n * n)) % 1))
-            u = mi.Point2f(dr.opaque(mi.Float, (k % n + 0.5) / n), dr.opaque(mi.Float, (k // n + 0.5) / n))
+            # The lobe's random number runs in bit-reversed order, so that each lobe sees the whole square.
+            lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n
+            lobe, x, y = (dr.opaque(mi.Float, value) for value in (lobe, x, y))  # one kernel for all strata
+            u = mi.Point2f(x, y)
             _, weight = self.bsdf.sample(context, si, lobe, u)
             total += mi.Color3f(weight)
             dr.eval(total)
@@ -386,7 +394,7 @@ class Material:
 
     def grey(self, mesh: TriangleMesh) -> bool:
         """Whether the BSDF provably reflects the three channels alike."""
-        if not self._classes <= self.SHOWN:
+        if not self._classes <= SHOWN:
             return False
         if "MeshAttribute" in self._classes and not all(
             _even(values) for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
@@ -396,7 +404,7 @@ class Material:
         return all(_even(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
-        """SHA-256 of the BSDF's description and of all parameters that `mi.traverse` shows, bitmaps included."""
+        """SHA-256 of the BSDF's text and of all parameters that `mi.traverse` shows, bitmaps included."""
         state = hashlib.sha256(self._text.encode())
         parameters = mi.traverse(self.bsdf)
         for name in sorted(parameters.keys()):
@@ -407,7 +415,7 @@ class Material:
 
 
 def _even(value: Any) -> bool:
-    """Whether colours, a `mi.Color3f` or [..., channel], have three equal channels; other things always do."""
+    """Whether colours, a `mi.Color3f` or [..., channel], have equal channels; other things always do."""
     values = np.array(value, np.float64)
     if isinstance(value, mi.Color3f):
         values = values.T  # [1, channel]
@@ -460,13 +468,15 @@ def _parametric(shape: mi.Shape, material: Material, edge_length: float, limit: 
             "replace it by a mesh (ply, obj), an instance by a copy of its shapes"
         )
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
+    mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
     return tessellation.parametric_mesh(
         kind,
         to_world,
         edge_length,
         material.name,
         limit=limit,
-        flip=shape.has_flipped_normals(),
+        flip=shape.has_flipped_normals() != mirrored,
         weld=material.constant,
     )
 
@@ -512,11 +522,7 @@ def _read(shape: mi.Mesh, name: str) -> TriangleMesh:
     n, t = shape.vertex_count(), shape.face_count()
     vertex_attributes, face_attributes = {}, {}
     for key in mi.traverse(shape).keys():
-        if key.startswith("vertex_") and key not in (
-            "vertex_positions",
-            "vertex_normals",
-            "vertex_texcoords",
-        ):
+        if key.startswith("vertex_") and key[7:] not in ("positions", "normals", "texcoords"):
             vertex_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(n, -1)
         elif key.startswith("face_"):
             face_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(t, -1)
@@ -573,7 +579,7 @@ def _mitsuba_mesh(
 def _mitsuba_scene(
     shapes: list[mi.Mesh], views: tuple[Mesh, ...], original: mi.Scene | None = None
 ) -> mi.Scene:
-    """A Mitsuba scene of these meshes, in this order, with the original's sensors, emitters and integrator."""
+    """A Mitsuba scene of these meshes, in order, with the original's sensors, emitters and integrator."""
     content: dict[str, Any] = {"type": "scene"}
     content.update({view.name: shape for view, shape in zip(views, shapes, strict=True)})
     if original is not None:
@@ -590,7 +596,7 @@ def _mitsuba_scene(
 
 
 def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """SplitMix64's finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words that scatters all bits."""
+    """SplitMix64's finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words, all bits scattered."""
     with np.errstate(over="ignore"):
         x = x + np.uint64(0x9E3779B97F4A7C15)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

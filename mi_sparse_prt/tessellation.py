@@ -18,12 +18,12 @@ from .errors import PrtError
 #: A triangle whose area is below this times the square of its longest edge is a line to float32.
 DEGENERATE = 1e-9
 
-#: Edges longer by this share than asked for are still accepted, so that ties (a square's diagonal is a power of two
-#: of its default edge) do not depend on how float32 rounds a scene that was scaled or moved.
+#: Edges longer by this share than asked for are still accepted, so that ties (a square's diagonal is a power
+#: of two of its default edge) do not depend on how float32 rounds a scene that was scaled or moved.
 TIE = 0.01
 
-#: Normals that agree with those that Mitsuba computes to this (times the cancellation in their sum) were computed by
-#: it: its parallel sums differ by 2e-7 from load to load.
+#: Normals that agree to this (times the cancellation in their sum) with those that Mitsuba computes were
+#: computed by it: its parallel sums differ by 2e-7 from load to load.
 COMPUTED = 1e-5
 
 #: A curved shape gets at least this many segments around, whatever the edge length.
@@ -55,8 +55,8 @@ class TriangleMesh:
     vertex_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     face_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
-    def take_vertices(self, index: NDArray[np.integer], triangles: NDArray[np.int32]) -> TriangleMesh:
-        """The mesh whose vertex k is this one's vertex ``index[k]``, with ``triangles`` in the new numbering."""
+    def take_vertices(self, index: NDArray[np.integer], triangles: NDArray[np.integer]) -> TriangleMesh:
+        """The mesh whose vertex k is this one's vertex ``index[k]``; ``triangles`` has the new numbers."""
         return replace(
             self,
             positions=self.positions[index],
@@ -89,14 +89,15 @@ def check_geometry(mesh: TriangleMesh) -> None:
     bad = np.flatnonzero(~np.isfinite(mesh.positions).all(axis=1))
     if bad.size:
         raise PrtError(
-            f"shape '{mesh.name}': vertex {bad[0]} has a position that is not finite ({bad.size} such vertices): "
-            "repair the mesh file"
+            f"shape '{mesh.name}': vertex {bad[0]} has a position that is not finite "
+            f"({bad.size} such vertices): repair the mesh file"
         )
     n = len(mesh.positions)
     bad = np.flatnonzero(((mesh.triangles < 0) | (mesh.triangles >= n)).any(axis=1))
     if bad.size:
         raise PrtError(
-            f"shape '{mesh.name}': triangle {bad[0]} refers to a vertex outside 0..{n - 1}: repair the mesh file"
+            f"shape '{mesh.name}': triangle {bad[0]} refers to a vertex outside 0..{n - 1}: "
+            "repair the mesh file"
         )
 
 
@@ -126,12 +127,12 @@ def drop_unreferenced(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 
 
 def angle_weighted_normals(mesh: TriangleMesh) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Unit vertex normals from face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
+    """Vertex normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998).
 
     Returns
     -------
     normals : (n, 3) float32
-        Where the faces cancel out, the normal of one of them; zero at vertices without faces.
+        Unit length. Where the faces cancel out, the normal of one of them; zero at vertices without faces.
     cancellation : (n,) float64
         Sum of weights over length of the sum: 1 where the faces agree, large where they cancel.
     """
@@ -157,9 +158,9 @@ def angle_weighted_normals(mesh: TriangleMesh) -> tuple[NDArray[np.float32], NDA
 def settle_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> TriangleMesh:
     """Normals with the same bits at every load, and none that only the loader's arithmetic spoilt.
 
-    Mitsuba computes normals for files that have none, with parallel sums whose order changes from load to load, and
-    gives NaN to the corners of triangles without area. What agrees with its computation is computed again here, in
-    float64 and in order; what the file gave is kept.
+    Mitsuba computes normals for files that have none, with parallel sums whose order changes from load to
+    load, and gives NaN to the corners of triangles without area. What agrees with its computation is computed
+    again here, in float64 and in order; what the file gave is kept.
 
     Parameters
     ----------
@@ -180,8 +181,8 @@ def settle_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> Trian
     bad = np.flatnonzero(lost & ~computed)
     if bad.size:
         raise PrtError(
-            f"shape '{mesh.name}': vertex {bad[0]} has a normal that is not finite ({bad.size} such vertices): "
-            "repair the mesh file, or leave its normals out"
+            f"shape '{mesh.name}': vertex {bad[0]} has a normal that is zero or not finite "
+            f"({bad.size} such vertices): repair the mesh file, or leave its normals out"
         )
     return replace(mesh, normals=np.where(computed[:, None], own, mesh.normals))
 
@@ -195,7 +196,7 @@ def split_by_face(mesh: TriangleMesh) -> TriangleMesh:
     corner_vertex = mesh.triangles.ravel()
     rounded = np.repeat(np.round(face * 1e4).astype(np.int64), 3, axis=0)
     keys = np.column_stack([corner_vertex, rounded])  # [3 t, vertex and normal]
-    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    first, index = _unique_rows(keys)
     split = mesh.take_vertices(corner_vertex[first], index.reshape(-1, 3))
     return replace(split, normals=face[first // 3].astype(np.float32))
 
@@ -229,13 +230,12 @@ def faces_inwards(mesh: TriangleMesh) -> bool:
     Vertices are welded by position first. A part is closed if each of its edges belongs to two triangles.
     Which way a triangle faces is what its shading normals say, since that is what a one-sided BSDF looks at.
     """
-    _, welded = np.unique(mesh.positions, axis=0, return_inverse=True)
-    t = welded.reshape(-1)[mesh.triangles]
+    t = _unique_rows(mesh.positions)[1][mesh.triangles]
     edges = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
-    _, edge, shared = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    edge = _unique_rows(edges)[1]
     part = _connected_parts(t)  # [triangle]
     is_open = np.zeros(part.max(initial=-1) + 1, bool)
-    is_open[np.repeat(part, 3)[shared[edge.reshape(-1)] != 2]] = True
+    is_open[np.repeat(part, 3)[np.bincount(edge)[edge] != 2]] = True
 
     p = mesh.positions.astype(np.float64)
     corners = (p - p.mean(axis=0))[mesh.triangles]
@@ -257,6 +257,16 @@ def _connected_parts(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
     _, label = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n)), directed=False)
     _, part = np.unique(label[triangles[:, 0]], return_inverse=True)
     return part.reshape(-1)
+
+
+def _unique_rows(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First index of each distinct row, and for each row which it is; far faster than `np.unique` by rows."""
+    code = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        _, value = np.unique(column, return_inverse=True)
+        _, code = np.unique(code * (value.max(initial=0) + 1) + value, return_inverse=True)
+    _, first = np.unique(code, return_index=True)
+    return first, code
 
 
 def _normalised(v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -312,10 +322,10 @@ def parametric_mesh(
     limit : int
         The largest number of vertices allowed.
     flip : bool
-        Normals point the other way (Mitsuba's ``flip_normals``).
+        Normals point inwards, or, on a disk, along its local -z.
     weld : bool
-        Merge vertices of equal position and normal (the seam and the poles) and leave texture coordinates out:
-        for materials that do not vary over the surface.
+        Merge vertices of equal position and normal (the seam and the poles) and leave texture coordinates
+        out: for materials that do not vary over the surface.
 
     Returns
     -------
@@ -325,19 +335,26 @@ def parametric_mesh(
     Raises
     ------
     PrtError
-        A `to_world` under which the shape is no sphere or cylinder any more; more than `limit` vertices.
+        A `to_world` of size zero, or under which the shape is no sphere or cylinder any more; more than `limit`
+        vertices.
     """
     linear = to_world[:3, :3]
     scale = np.linalg.norm(linear, axis=0)  # of the local axes x, y, z
+    if not np.all(scale > 0):
+        raise PrtError(f"shape '{name}': its to_world leaves no size: the scale must not be zero")
     skew = np.abs(linear.T @ linear / np.outer(scale, scale) - np.eye(3)).max()
     round_axes = {"sphere": scale, "cylinder": scale[:2], "disk": scale[:1]}[shape]
     if shape != "disk" and (skew > 1e-3 or np.ptp(round_axes) > 1e-3 * scale[0]):
         raise PrtError(
-            f"shape '{name}': the to_world of a {shape} must not shear it or scale it unevenly: use a mesh instead"
+            f"shape '{name}': the to_world of a {shape} must not shear it or scale it unevenly: "
+            "use a mesh instead"
         )
     radius = max(scale[0], scale[1])
     around = 4 * max(MIN_SEGMENTS // 4, _segments(np.pi / 2 * radius, edge_length))
-    # `angle` is the axis of (u, v) that runs around, `across` counts the other one; at poles circles shrink to points.
+    # `angle` is the axis of (u, v) that runs around, `across` counts along the other one, `poles` are its ends
+    # where circles shrink to points.
+    surface: Parametrisation
+    poles: tuple[int, ...]
     if shape == "sphere":
         surface, angle, poles = _sphere, 0, (0, 1)
         across = 2 * max(MIN_SEGMENTS // 4, _segments(np.pi / 2 * radius, edge_length))
@@ -346,28 +363,30 @@ def parametric_mesh(
     else:
         surface, angle, poles, across = _cylinder, 0, (), _segments(scale[2], edge_length)
     if (around + 1) * (across + 1) > limit:
-        raise PrtError(
-            f"shape '{name}': edges of {edge_length:.4g} need more than {limit} vertices: use a larger edge_length"
-        )
+        raise _too_many(name, edge_length, limit)
     uv, triangles = _grid(around, across, angle, poles)
     wrapped = uv.copy()
     wrapped[uv[:, angle] == 1, angle] = 0.0  # the seam's two sides have the same bits
     local, normal = surface(wrapped[:, 0], wrapped[:, 1])
     local = np.where(np.abs(local) < 1e-15, 0.0, local)  # sin(pi) is not zero: poles meet in one point
 
-    positions = local @ linear.T + to_world[:3, 3]
-    normals = _normalised(normal @ np.linalg.inv(linear))
-    mesh = TriangleMesh(
-        name, positions.astype(np.float32), normals.astype(np.float32), triangles, uv.astype(np.float32)
-    )
+    positions = (local @ linear.T + to_world[:3, 3]).astype(np.float32)
+    normals = _normalised(normal @ np.linalg.inv(linear)).astype(np.float32)
+    mesh = TriangleMesh(name, positions, normals, triangles, uv.astype(np.float32))
+    against = np.sum(triangle_normals(mesh) * normals[triangles].sum(axis=1), axis=1) < 0
+    triangles[against] = triangles[against][:, [0, 2, 1]]
     if weld:
-        keys = np.column_stack([mesh.positions, mesh.normals]) + np.float32(0)
-        _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        mesh = replace(mesh.take_vertices(first, index.reshape(-1)[triangles]), texcoords=None)
-    faces = triangle_normals(mesh)
-    against = np.sum(faces * mesh.normals[mesh.triangles].sum(axis=1), axis=1) < 0
-    mesh.triangles[against] = mesh.triangles[against][:, [0, 2, 1]]
+        keys = np.column_stack([positions, normals]) + np.float32(0)  # -0 and 0 are one
+        first, index = _unique_rows(keys)
+        mesh = replace(mesh.take_vertices(first, index[triangles]), texcoords=None)
     return flipped(mesh) if flip else mesh
+
+
+def _too_many(name: str, edge_length: float, limit: int) -> PrtError:
+    return PrtError(
+        f"shape '{name}': edges of {edge_length:.4g} need more than {limit} vertices: "
+        "use a larger edge_length (inf leaves meshes as they are)"
+    )
 
 
 def _segments(length: float, edge_length: float) -> int:
@@ -410,10 +429,10 @@ def _grid(
 def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMesh:
     """Bisect every edge longer than `edge_length` until none is left.
 
-    An edge's length decides alone, so both of its sides split at the same midpoint and no T-junction appears, also
-    between vertices that share a position but not a normal. Triangles with one, two or three long edges become two,
-    three or four. Positions are interpolated linearly; normals too, then normalised; texture coordinates and
-    attributes linearly. The old vertices come first, in their order.
+    An edge's length decides alone, so both of its sides split at the same midpoint and no T-junction appears,
+    also between vertices that share a position but not a normal. Triangles with one, two or three long edges
+    become two, three or four. Positions, texture coordinates and attributes are interpolated linearly; normals
+    too, then normalised. The old vertices come first, in their order.
 
     Parameters
     ----------
@@ -427,6 +446,11 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
     PrtError
         If more than `limit` vertices would be needed.
     """
+    # No triangle with such edges is larger than the equilateral one, and a surface has half as many vertices as
+    # triangles: refuse what is hopeless before it is built.
+    area = float(np.linalg.norm(triangle_normals(mesh), axis=1).sum()) / 2
+    if area / (np.sqrt(3) / 4 * (edge_length * (1 + TIE)) ** 2) / 2 > 1.1 * limit:
+        raise _too_many(mesh.name, edge_length, limit)
     while True:
         t = mesh.triangles
         edges = np.sort(
@@ -441,10 +465,7 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
             return mesh
         count = len(mesh.positions) + int(np.sum(long))
         if count > limit:
-            raise PrtError(
-                f"shape '{mesh.name}': edges of {edge_length:.4g} need more than {limit} vertices: "
-                "use a larger edge_length (inf leaves meshes as they are)"
-            )
+            raise _too_many(mesh.name, edge_length, limit)
         midpoint = np.full(len(ends), -1, np.int64)
         midpoint[long] = np.arange(len(mesh.positions), count)
         mesh = _split(_with_midpoints(mesh, ends[long]), midpoint[inverse.reshape(-1, 3)])
@@ -472,7 +493,7 @@ def _with_midpoints(mesh: TriangleMesh, ends: NDArray[np.int64]) -> TriangleMesh
 
 
 def _split(mesh: TriangleMesh, midpoint: NDArray[np.int64]) -> TriangleMesh:
-    """Triangles split at `midpoint` [triangle, edge], -1 where an edge stays; edge k joins corners k and k + 1."""
+    """Triangles split at `midpoint` [triangle, edge], -1 for edges that stay; edge k joins corners k, k + 1."""
     t = mesh.triangles.astype(np.int64)
     n_split = np.sum(midpoint >= 0, axis=1)
     # Rotate corners so that the one split edge is edge 0, and the one whole edge of two splits is edge 2.

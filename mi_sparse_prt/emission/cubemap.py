@@ -6,7 +6,7 @@ maps. Texel (row, col) of face f has index j = f n^2 + row n + col and covers th
 the direction `centre + s * s_axis + t * t_axis` with the axes of `FACE_FRAMES`.
 
 NumPy arrays are used where things are computed once; the functions on Dr.Jit arrays (`face_coordinates`,
-`face_direction`, `texel_index`) are also what the `cubemap` emitter traces.
+`face_direction`, `texel_at`) are also what the `cubemap` emitter traces.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class CubemapLighting:
         if directions.ndim != 2 or directions.shape[1] != 3:
             raise PrtError(f"directions have shape {directions.shape}; give (m, 3)")
         d = mi.Vector3f(np.ascontiguousarray(directions.T))
-        return texel_index(d, self.resolution).numpy().astype(np.int32)
+        return texel_at(*face_coordinates(d), self.resolution).numpy().astype(np.int32)
 
     def subdirections(self, s: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split every texel into s x s squares of face coordinates.
@@ -133,7 +133,9 @@ class CubemapLighting:
         try:
             texels = np.array(values, dtype=np.float32)
         except (TypeError, ValueError) as error:
-            raise PrtError(f"cannot light the scene with {type(values).__name__}: see CubemapLighting.project") from error
+            raise PrtError(
+                f"cannot light the scene with {type(values).__name__}: see CubemapLighting.project"
+            ) from error
         n = self.resolution
         if texels.shape in ((), (1,), (3,)):  # one radiance for all directions
             texels = np.broadcast_to(texels, (self.n_directions, 3)).copy()
@@ -143,7 +145,9 @@ class CubemapLighting:
                 "a number or an RGB triple"
             )
         if not np.isfinite(texels).all():
-            raise PrtError(f"lighting has {(~np.isfinite(texels)).sum()} values that are NaN or infinite; repair it")
+            raise PrtError(
+                f"lighting has {(~np.isfinite(texels)).sum()} values that are NaN or infinite; repair it"
+            )
         return texels.reshape(-1, 3)
 
 
@@ -151,8 +155,8 @@ class CubemapLighting:
 # Geometry, Dr.Jit
 
 
-def face_coordinates(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
-    """Face of each direction (any length), its coordinates s, t in [-1, 1], and its largest |component|.
+def face_coordinates(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """Face of each direction (any length) and its coordinates s, t in [-1, 1].
 
     On edges shared by faces the first face of the order wins.
     """
@@ -164,7 +168,7 @@ def face_coordinates(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.
         face = dr.select(here, f, face)
         s = dr.select(here, dr.dot(s_axis, d), s)
         t = dr.select(here, dr.dot(t_axis, d), t)
-    return face, s / largest, t / largest, largest
+    return face, s / largest, t / largest
 
 
 def face_direction(face: mi.UInt32, s: mi.Float, t: mi.Float) -> mi.Vector3f:
@@ -176,9 +180,8 @@ def face_direction(face: mi.UInt32, s: mi.Float, t: mi.Float) -> mi.Vector3f:
     return dr.normalize(d)
 
 
-def texel_index(d: mi.Vector3f, n: int) -> mi.UInt32:
-    """Index j of the texel that each direction points at, on a cubemap of n x n faces."""
-    face, s, t, _ = face_coordinates(d)
+def texel_at(face: mi.UInt32, s: mi.Float, t: mi.Float, n: int) -> mi.UInt32:
+    """Index j of the texel that the point (s, t) of a face of n x n texels lies in."""
     row, col = (dr.clip(mi.Int32(dr.floor((x + 1) * (n / 2))), 0, n - 1) for x in (t, s))
     return (face * n + mi.UInt32(row)) * n + mi.UInt32(col)
 
@@ -212,7 +215,9 @@ def _subtexels(texels: NDArray[np.int_], n: int, s: int) -> tuple[NDArray[np.flo
 def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[np.float32]:
     """Mean of `emitter.eval` over each texel, by s x s samples weighted with their exact solid angles."""
     if not emitter.is_environment():
-        raise PrtError(f"emitter {emitter.class_name()} is not an environment: it does not shine from infinity")
+        raise PrtError(
+            f"emitter {emitter.class_name()} is not an environment: it does not shine from infinity"
+        )
     n = lighting.resolution
     s = _samples_per_edge(emitter, n)
     block = max(1, SAMPLES_PER_BLOCK // s**2)
@@ -222,7 +227,7 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
         directions, weights = _subtexels(texels, n, s)
         si = dr.zeros(mi.SurfaceInteraction3f, weights.size)
         si.wi = mi.Vector3f(np.ascontiguousarray(-directions.reshape(-1, 3).T, dtype=np.float32))
-        values = np.array(emitter.eval(si), dtype=np.float64)  # [rgb, texel * sub], or a single column if constant
+        values = np.array(emitter.eval(si), dtype=np.float64)  # [rgb, texel * sub], one column if constant
         values = np.broadcast_to(values, (3, weights.size)).reshape(3, *weights.shape)
         radiance[texels] = ((values * weights).sum(axis=2) / weights.sum(axis=1)).T
     return radiance.astype(np.float32)
@@ -230,11 +235,12 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
 
 def _samples_per_edge(emitter: mi.Emitter, n: int) -> int:
     """Samples along a texel's edge that resolve the emitter: its own texels, or a quarter of its pixels."""
+    own_resolution = getattr(emitter, "resolution", None)
+    if own_resolution is not None:  # our `cubemap`: one sample in each of its texels is exact
+        return max(1, own_resolution // n)
     parameters = mi.traverse(emitter)
-    shape = parameters["data"].shape if "data" in parameters else ()
-    if len(shape) == 4:  # a cubemap [face, row, col, rgb]: one sample in each of its texels is exact
-        return max(1, shape[1] // n)
-    if len(shape) == 3:  # an image [row, col, rgb] of h rows, pi / h each; a texel is at most 2 / n wide
+    shape: tuple[int, ...] = parameters["data"].shape if "data" in parameters else ()
+    if len(shape) == 3:  # an image [row, col, rgb] with rows of pi / h radians; a texel is at most 2 / n wide
         return max(4, int(np.ceil(4 * (2 / n) / (np.pi / shape[0]))))
     return 16
 
@@ -247,9 +253,10 @@ def _project_image(environment: Environment, lighting: CubemapLighting) -> NDArr
     excess = np.empty((6, n, n, 3))  # [face, row, col, rgb], integral of (image - mean)
     edges = 2 * np.arange(n + 1) / n - 1
     for face, (s_axis, t_axis, centre) in enumerate(FACE_FRAMES):
-        corners = centre + edges[None, :, None] * s_axis + edges[:, None, None] * t_axis  # [row edge, col edge, xyz]
+        # [row edge, col edge, xyz]
+        corners = centre + edges[None, :, None] * s_axis + edges[:, None, None] * t_axis
         corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
-        corners = corners @ environment.rotation  # into the environment's frame: the transpose of its rotation
+        corners = corners @ environment.rotation  # by its transpose, into the environment's frame
         along_s, along_t = (
             potential.along_arcs(start.reshape(-1, 3), end.reshape(-1, 3)).reshape(start.shape)
             for start, end in ((corners[:, :-1], corners[:, 1:]), (corners[:-1], corners[1:]))

@@ -57,7 +57,9 @@ class Environment:
         If the image has NaN or infinite pixels or not the shape above, or `rotation` is not a rotation.
     """
 
-    def __init__(self, pixels: ArrayLike, rotation: ArrayLike | None = None, source: str = "environment") -> None:
+    def __init__(
+        self, pixels: ArrayLike, rotation: ArrayLike | None = None, source: str = "environment"
+    ) -> None:
         pixels = np.array(pixels, dtype=np.float32)  # [h, w, rgb], a copy of our own
         _check_shape(pixels, source)
         _check_finite(pixels, source)
@@ -67,7 +69,7 @@ class Environment:
         self.rotation: NDArray[np.float64] = np.eye(3) if rotation is None else _checked_rotation(rotation)
 
     @property
-    def solid_angles(self) -> NDArray[np.float64]:
+    def solid_angles(self) -> NDArray[np.floating]:
         """Exact solid angle of every pixel, (h, w), in steradians; they sum to 4 pi."""
         return pixel_solid_angles(*self.pixels.shape[:2])
 
@@ -120,7 +122,9 @@ def load_environment(path: str | os.PathLike[str]) -> Environment:
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise PrtError(f"{path}: not an HDR image by its name; give a file that ends in {', '.join(SUFFIXES)}")
+        raise PrtError(
+            f"{path}: not an HDR image by its name; give a file that ends in {', '.join(SUFFIXES)}"
+        )
     if not path.is_file():
         raise PrtError(f"{path}: no such file")
     try:
@@ -135,7 +139,7 @@ def _rgb_of(bitmap: mi.Bitmap, path: Path) -> NDArray[np.float32]:
     """(h, w, 3) linear RGB of a bitmap, without conversion of its values."""
     formats = mi.Bitmap.PixelFormat
     pixels = np.array(bitmap, dtype=np.float32)
-    pixels = pixels.reshape(*pixels.shape[:2], -1)  # [h, w, channel]; grey bitmaps may come without the last axis
+    pixels = pixels.reshape(*pixels.shape[:2], -1)  # [h, w, channel], also of grey bitmaps
     if bitmap.pixel_format() in (formats.RGB, formats.RGBA):
         return pixels[..., :3]
     if bitmap.pixel_format() in (formats.Y, formats.YA):
@@ -170,8 +174,9 @@ def _clamp_negative(pixels: NDArray[np.float32], source: str) -> dict[str, Any]:
     negative = (pixels < 0).any(axis=2)  # [h, w]
     share = 0.0
     if negative.any():
-        absolute = np.abs(pixels, dtype=np.float64) * pixel_solid_angles(*pixels.shape[:2])[..., None]
-        share = float(absolute[pixels < 0].sum() / absolute.sum())
+        solid_angles = pixel_solid_angles(*pixels.shape[:2])
+        lost = np.einsum("hwc,hw->", np.minimum(pixels, 0), solid_angles)
+        share = float(-lost / np.einsum("hwc,hw->", np.abs(pixels), solid_angles))
         np.maximum(pixels, 0, out=pixels)
         warnings.warn(
             f"{source}: {negative.sum()} pixels ({negative.mean():.2%}) were negative and are clamped to 0; "
@@ -189,9 +194,10 @@ def _clamp_negative(pixels: NDArray[np.float32], source: str) -> dict[str, Any]:
 def _about_up(degrees: float) -> NDArray[np.float64]:
     if not np.isfinite(degrees):
         raise PrtError(f"rotation by {degrees} degrees: give a finite angle")
-    # Quarter turns are exact, so that they permute texels and nothing else
-    sine, cosine = (round(v) if degrees % 90 == 0 else v for v in (np.sin(np.radians(degrees)), np.cos(np.radians(degrees))))
-    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]], dtype=np.float64)
+    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    if degrees % 90 == 0:  # exact, so that quarter turns permute faces and nothing else
+        sine, cosine = np.round(sine), np.round(cosine)
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
 
 def _checked_rotation(matrix: ArrayLike) -> NDArray[np.float64]:
@@ -203,4 +209,5 @@ def _checked_rotation(matrix: ArrayLike) -> NDArray[np.float64]:
         raise PrtError(f"rotation matrix is not orthonormal (off by {error:.2g}); it may not scale or shear")
     if np.linalg.det(matrix) < 0:
         raise PrtError("rotation matrix has determinant -1: it mirrors; flip one of its axes")
-    return matrix
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ vt  # the nearest rotation: matrices often come in float32

@@ -26,7 +26,9 @@ def upsampling(coarse: CubemapLighting, fine: CubemapLighting) -> scipy.sparse.c
         return scipy.sparse.eye_array(fine.n_directions, format="csr", dtype=np.float32)
     n, m = fine.resolution, coarse.resolution
     face, row, col = np.unravel_index(np.arange(fine.n_directions), (6, n, n))
-    y, x = ((i + 0.5) * m / n - 0.5 for i in (row, col))  # in units of coarse texels, centres at whole numbers
+    y, x = (
+        (i + 0.5) * m / n - 0.5 for i in (row, col)
+    )  # in units of coarse texels, centres at whole numbers
     data, indices = [], []
     for dy in (0, 1):
         for dx in (0, 1):

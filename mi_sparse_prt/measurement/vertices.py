@@ -16,6 +16,10 @@ from mi_sparse_prt.scene import Scene
 # Later pairs are for vertices that the first ones miss (slivers, surfaces in contact).
 _APPROACHES = ((1e-2, 2e-4), (3e-2, 1e-4), (1e-1, 3e-5), (3e-2, 1e-3))
 
+# Vertices on a mesh's border move into their triangle by this many of Mitsuba's ray offsets, or by a quarter of the
+# way to its centre if that is less.
+_BORDER_OFFSETS = 4
+
 
 @dataclass(frozen=True)
 class Points:
@@ -42,8 +46,35 @@ class Points:
 
 
 def vertex_points(scene: Scene) -> Points:
-    """Return the scene's vertices themselves as measurement points."""
-    return Points(scene.normalised_positions, scene.normals, scene.normals, scene.vertex_keys)
+    """Return the scene's vertices as measurement points.
+
+    Vertices on the border of a mesh stand for the surface inside of it and are moved there by a few ray offsets (5e-4
+    of the scene's longest side). Exactly on the border, where another surface often begins (the corners of a room, a
+    box on the ground), their rays would start in that surface and leak through it.
+    """
+    positions = scene.normalised_positions
+    triangles = np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
+    border = _border_vertices(triangles)
+    owners, rank, corners = _triangles_of_vertices(positions, triangles)
+    chosen = (rank == 0) & border[owners]
+    ids, face = owners[chosen], corners[chosen] // 3
+    inwards = positions[triangles[face]].astype(np.float64).mean(axis=1) - positions[ids]  # [border vertex, xyz]
+    length = np.linalg.norm(inwards, axis=1, keepdims=True)
+    offset = _BORDER_OFFSETS * float(mi.math.RayEpsilon) * (1 + np.abs(positions[ids]).max(axis=1, keepdims=True))
+    moved = positions.copy()
+    moved[ids] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
+    return Points(moved, scene.normals, scene.normals, scene.vertex_keys)
+
+
+def _border_vertices(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which vertices have an edge that belongs to one triangle only."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)  # [edge of a triangle, end]
+    n = int(triangles.max()) + 1
+    keys, count = np.unique(edges[:, 0] * n + edges[:, 1], return_counts=True)
+    border = np.zeros(n, dtype=bool)
+    single = keys[count == 1]
+    border[single // n] = border[single % n] = True
+    return border
 
 
 @dataclass(frozen=True)
@@ -61,6 +92,10 @@ class VertexRays:
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
     missed: NDArray[np.bool_]
+
+    def chosen(self, vertices: NDArray[np.integer]) -> VertexRays:
+        """The rays of some vertices."""
+        return VertexRays(self.origins[vertices], self.directions[vertices], self.missed[vertices])
 
 
 def vertex_rays(scene: mi.Scene) -> VertexRays:

@@ -1,0 +1,34 @@
+"""What a timing depends on besides the code: processor, memory, versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import psutil
+
+from mi_sparse_prt.precompute import _versions
+
+
+def describe_machine() -> dict[str, Any]:
+    """``cpu``, ``cores`` that this process may use, ``memory_bytes``, ``load`` before and now, ``versions``."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "drjit_threads": dr.thread_count(),
+        "memory_bytes": psutil.virtual_memory().total,
+        "load_average": os.getloadavg()[0],  # above the number of cores: others were working, times are too long
+        "system": platform.platform(),
+        "versions": _versions(),
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

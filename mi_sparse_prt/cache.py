@@ -1,0 +1,58 @@
+"""Matrices that were computed before, found again by what they depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.errors import PrtError, PrtWarning
+from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.precompute import checked_settings, precompute
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.storage import VERSION, load_transport
+
+
+def default_folder() -> Path:
+    """``mi_sparse_prt`` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_sparse_prt"
+
+
+def cached_precompute(
+    scene: Scene, lighting: CubemapLighting, folder: Path | None = None, progress: bool = True, **settings: Any
+) -> LightTransport:
+    """``precompute``, or the matrix that an earlier call left in a folder.
+
+    Parameters
+    ----------
+    scene : Scene
+    lighting : CubemapLighting
+    folder : Path, optional
+        Made if it does not exist; the default is ``default_folder()``. Files in it may be deleted at any time.
+    progress : bool
+    **settings
+        As for ``precompute``. Together with the scene's hash they are the key of the file; the order of the scene's
+        shapes is not part of it.
+    """
+    key = json.dumps(
+        [VERSION, scene.hash, lighting.resolution, asdict(checked_settings(lighting, **settings))], sort_keys=True
+    )
+    folder = folder or default_folder()
+    path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.prt"
+    if path.exists():
+        try:
+            return load_transport(path, scene)
+        except PrtError as error:
+            warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
+    transport = precompute(scene, lighting, progress=progress, **settings)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        transport.save(path)
+    except (OSError, PrtError) as error:  # the result is good, only not kept
+        warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
+    return transport

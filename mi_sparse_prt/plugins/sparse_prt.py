@@ -1,0 +1,114 @@
+"""The whole pipeline as a Mitsuba integrator."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import mitsuba as mi
+
+from mi_sparse_prt.cache import cached_precompute
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.errors import PrtError, PrtWarning
+from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
+from mi_sparse_prt.scene import Scene
+
+
+class SparsePRT(mi.SamplingIntegrator):
+    """Integrator ``sparse_prt``: a scene lit by its environment through a precomputed light transport matrix.
+
+    On the first render of a scene its matrix is computed and kept in a cache; later renders, under whatever
+    environment (``envmap``, ``constant``, ``cubemap``) and from whatever camera, only apply it. The camera sees the
+    irradiance of the vertices, interpolated over triangles, times the albedo texture at the pixel. Emitters other than
+    the environment do not take part.
+
+    XML::
+
+        <integrator type="sparse_prt">
+            <integer name="resolution" value="32"/>
+            <integer name="max_depth" value="5"/>
+            <integer name="indirect_resolution" value="8"/>
+            <boolean name="reference" value="false"/>
+            <integrator type="path"><integer name="max_depth" value="5"/></integrator>
+        </integrator>
+
+    dict::
+
+        {"type": "sparse_prt", "resolution": 32, "max_depth": 5, "reference_integrator": {"type": "path"}}
+
+    =================== ========== =============================================================================
+    Parameter           Type       Meaning
+    =================== ========== =============================================================================
+    resolution          integer    Texels along an edge of the lighting's cubemap, a power of two. (32)
+    method              string     As for ``prt.precompute``. (brute_force)
+    basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
+    max_depth           integer    As for ``path``; 2 is direct light only. (5)
+    precompute_spp      integer    Paths per indirect element. (16)
+    indirect_resolution integer    Texels along an edge of the indirect light's cubemap. (8, or ``resolution``)
+    strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
+    edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
+    seed                integer    Of the precomputation. (0)
+    cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
+    progress            boolean    Show a forecast and progress bars while precomputing. (true)
+    reference           boolean    Render with the nested integrator instead. (false)
+    (nested)            integrator The reference. (``path`` of the same ``max_depth``)
+    =================== ========== =============================================================================
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self._lighting = CubemapLighting(props.get("resolution", 32))
+        coarse = min(8, self._lighting.resolution)
+        self._settings = {
+            "method": props.get("method", "brute_force"),
+            "basis": props.get("basis", "texel"),
+            "max_depth": props.get("max_depth", 5),
+            "spp": props.get("precompute_spp", 16),
+            "indirect_resolution": props.get("indirect_resolution", coarse),
+            "strata": props.get("strata", 2),
+            "seed": props.get("seed", 0),
+        }
+        self._edge_length = props.get("edge_length", 0.0) or None
+        cache = props.get("cache", "")
+        self._cache = Path(cache) if cache else None
+        self._progress = props.get("progress", True)
+        self._use_reference = props.get("reference", False)
+        nested = [value for _, value in props.objects() if isinstance(value, mi.Integrator)]
+        self._reference = (
+            nested[0] if nested else mi.load_dict({"type": "path", "max_depth": self._settings["max_depth"]})
+        )
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render a camera (world units, linear RGB); the arguments are those of every Mitsuba integrator.
+
+        Raises
+        ------
+        PrtError
+            If the scene has no environment, or cannot be used (see ``prt.load_scene``, ``prt.precompute``).
+        """
+        if self._use_reference:
+            return self._reference.render(scene, sensor, seed, spp, develop, evaluate)
+        environment = scene.environment()
+        if environment is None:
+            raise PrtError("sparse_prt: the scene has no environment; add an emitter envmap, constant or cubemap")
+        if len(scene.emitters()) > 1:
+            warnings.warn(
+                "sparse_prt: only the environment lights the scene, its other emitters are left out",
+                PrtWarning,
+                stacklevel=2,
+            )
+        surfaces = Scene.from_mitsuba(scene, self._edge_length)
+        transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
+        relit = RelitScene(surfaces, transport.irradiance(environment), environment)
+        return RelitIntegrator(relit).render(scene, sensor, seed, spp, develop, evaluate)
+
+    def to_string(self) -> str:
+        return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"

@@ -1,0 +1,149 @@
+"""R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.scene import Scene
+
+
+class RelitScene:
+    """A scene with the light of one relighting on its vertices, ready to be looked at.
+
+    Parameters
+    ----------
+    scene : Scene
+    irradiance : (n_v, 3) float32
+        Irradiance / pi at the vertices: ``LightTransport.irradiance``.
+    background : mi.Emitter or None
+        What rays see that leave the scene.
+
+    Notes
+    -----
+    Only the side of a surface that its normals point to has light; the other side is black.
+    """
+
+    def __init__(self, scene: Scene, irradiance: NDArray[np.float32], background: mi.Emitter | None) -> None:
+        self._scene, self._background = scene.mitsuba, background
+        self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
+        self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
+        self._first_triangle = _by_shape([len(mesh.triangles) for mesh in scene.meshes], self._scene)
+
+    def radiance(self, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+        """Radiance towards the origins of rays (world), and which rays meet a surface."""
+        hit = self._scene.ray_intersect_preliminary(ray, active=active)
+        si = hit.compute_surface_interaction(ray, active=active)
+        valid = active & si.is_valid()
+        first = dr.gather(mi.UInt32, self._first_triangle, dr.reinterpret_array(mi.UInt32, hit.shape), valid)
+        triangle = first + hit.prim_index
+        u, v = hit.prim_uv
+        vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
+        irradiance, albedo = (
+            sum(w * dr.gather(mi.Color3f, values, i, valid) for w, i in zip((1 - u - v, u, v), vertices, strict=True))
+            for values in (self._irradiance, self._albedo)
+        )
+        bsdf = si.bsdf()
+        diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        textured = bsdf.eval_diffuse_reflectance(si, valid)
+        front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
+        value = dr.select(front, irradiance * dr.select(diffuse, textured, albedo), 0)
+        if self._background is not None:
+            value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
+        return value, valid
+
+
+class RelitIntegrator(mi.SamplingIntegrator):
+    """A Mitsuba integrator that looks at a ``RelitScene``; sampling, filtering and films are Mitsuba's own."""
+
+    def __init__(self, relit: RelitScene) -> None:
+        super().__init__(mi.Properties())
+        self._relit = relit
+
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Mask = True,
+    ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
+        value, valid = self._relit.radiance(mi.Ray3f(ray), mi.Mask(active))
+        return value, valid, []
+
+
+def render(
+    scene: Scene,
+    transport: LightTransport,
+    environment: Environment | mi.Emitter | ArrayLike,
+    sensor: int | mi.Sensor = 0,
+    spp: int = 64,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """Render a camera's view of the relit scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene of the matrix.
+    transport : LightTransport
+    environment : Environment, emitter or (n_directions, 3) float
+        The light; also the background.
+    sensor : int or mi.Sensor
+        One of ``scene.mitsuba.sensors()``, or any other.
+    spp : int
+        Samples per pixel (for edges and textures: the light itself has no noise).
+    seed : int
+
+    Returns
+    -------
+    (height, width, 3) float32, linear RGB
+
+    Raises
+    ------
+    PrtError
+        If the scene has no such sensor, or the matrix belongs to another scene.
+    """
+    if isinstance(sensor, int):
+        sensors = scene.mitsuba.sensors()
+        if not -len(sensors) <= sensor < len(sensors):
+            raise PrtError(f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}")
+        sensor = sensors[sensor]
+    irradiance = transport.for_scene(scene).irradiance(environment)
+    relit = RelitScene(scene, irradiance, background_emitter(environment, transport))
+    image = mi.render(scene.mitsuba, sensor=sensor, integrator=RelitIntegrator(relit), spp=spp, seed=seed)
+    return np.array(image)[..., :3]
+
+
+def background_emitter(environment: Environment | mi.Emitter | ArrayLike, transport: LightTransport) -> mi.Emitter:
+    """An environment as a Mitsuba emitter: an image as ``envmap``, texel values as ``cubemap``."""
+    if isinstance(environment, mi.Emitter):
+        return environment
+    if isinstance(environment, Environment):
+        to_world = np.eye(4)
+        to_world[:3, :3] = environment.rotation
+        return mi.load_dict(
+            {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(np.ascontiguousarray(environment.pixels)),
+                "to_world": mi.ScalarTransform4f(to_world),
+            }
+        )
+    texels = transport.lighting.project(environment)
+    n = transport.lighting.resolution
+    return mi.load_dict({"type": "cubemap", "data": mi.TensorXf(texels.reshape(6, n, n, 3)), "resolution": n})
+
+
+def _by_shape(counts: list[int], scene: mi.Scene) -> mi.UInt32:
+    """First triangle of every shape among all, indexed by the number that Dr.Jit knows the shape by."""
+    numbers = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+    first = np.zeros(int(numbers.max()) + 1, dtype=np.uint32)
+    first[numbers] = np.cumsum([0, *counts[:-1]])
+    return mi.UInt32(first)

@@ -1,0 +1,267 @@
+"""Is the matrix right? Rows and columns against Mitsuba's own render of the matrix, and a relit image against ``path``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import flip_evaluator
+import mitsuba as mi
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.measurement.vertices import VertexRays, sensor_points, vertex_points, vertex_rays
+from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.validation import figures as draw
+from mi_sparse_prt.validation.reference import ReferenceMatrix, reference_image
+
+GRAZED = 1e-4  # relative difference from which an element of the direct part counts as different
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Outcome of ``validate``.
+
+    Attributes
+    ----------
+    report : dict
+        JSON as it is. ``relative_l2`` (``total``, ``meshes``): error with the reference's noise taken out;
+        ``reference_noise``; ``with_noise``: the plain difference; ``row_95th_percentile``, ``row_worst``,
+        ``column_worst``; ``estimated_error``: what the matrix said of itself; ``direct_at_hits`` and
+        ``hit_against_vertex``: see ``validate``; ``image``: relative L2, noise and FLIP.
+    figures : dict of matplotlib Figure
+        ``image``, ``errors``, ``rows``.
+    """
+
+    report: dict[str, Any]
+    figures: dict[str, Figure]
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``report.json`` and a PNG of every figure into a folder (made if needed)."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "report.json").write_text(json.dumps(self.report, indent=1))
+        for name, figure in self.figures.items():
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+
+
+def validate(
+    scene: Scene,
+    transport: LightTransport,
+    n_rows: int = 64,
+    n_columns: int = 256,
+    spp: int = 1024,
+    seed: int = 0,
+    progress: bool = True,
+    *,
+    image: bool = True,
+    image_width: int = 320,
+    image_spp: int = 256,
+) -> Validation:
+    """Compare a matrix with Mitsuba's full render of it.
+
+    Parameters
+    ----------
+    scene : Scene
+    transport : LightTransport
+    n_rows, n_columns : int
+        Vertices (drawn per mesh) and texels (drawn per stretch of the cubemap) that are rendered; all, if there are
+        no more.
+    spp : int
+        Samples per element of the reference, in two independent halves: their difference is its noise.
+    seed : int
+        Of the choice and of the reference.
+    progress : bool
+    image : bool
+        Also relight under the scene's own environment and compare with ``path`` under the same cubemap (if the scene
+        has a sensor and an environment).
+    image_width, image_spp : int
+        Size of the image; samples per pixel of its reference.
+
+    Returns
+    -------
+    Validation
+
+    Notes
+    -----
+    Mitsuba sees a vertex from a ray that ends beside it. ``direct_at_hits`` is our direct part, evaluated where
+    that ray ends and with the normal there, against Mitsuba's: the share of elements that differ by more than 1e-4.
+    ``hit_against_vertex`` is what moving from vertices to hits changes in the direct part, in relative L2.
+    """
+    transport = transport.for_scene(scene)
+    rng = np.random.default_rng([seed, 2])
+    vertices = _stratified_vertices(transport.meshes, n_rows, rng)
+    texels = _stratified(transport.lighting.n_directions, n_columns, rng)
+    rays = vertex_rays(scene.normalised)
+    max_depth = transport.report["parameters"]["max_depth"]
+
+    reference = ReferenceMatrix(scene, transport.lighting, transport.basis, max_depth, vertices, rays)
+    halves = [reference.columns(texels, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)]
+    ours = transport.rows(vertices)
+    report = matrix_errors(ours[:, texels], halves[0], halves[1], vertices, texels, transport.meshes)
+    report["estimated_error"] = transport.report.get("estimated_error")
+    report["missed_vertices"] = int(rays.missed.sum())
+    report |= _direct_at_hits(scene, transport, rays, vertices, texels)
+    report["parameters"] = {"rows": len(vertices), "columns": len(texels), "spp": spp, "seed": seed}
+    figures = {
+        "errors": draw.errors(ours[:, texels], (halves[0] + halves[1]) / 2, vertices, transport.meshes),
+        "rows": draw.rows(ours, transport.lighting, vertices),
+    }
+    environment = scene.mitsuba.environment()
+    if image and environment is not None and scene.mitsuba.sensors():
+        report["image"], figures["image"] = _image_error(scene, transport, environment, image_width, image_spp, seed)
+    return Validation(report, figures)
+
+
+def matrix_errors(
+    ours: NDArray[np.float32],
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    vertices: NDArray[np.integer],
+    texels: NDArray[np.integer],
+    meshes: tuple[MeshRange, ...],
+) -> dict[str, Any]:
+    """Errors of a part of a matrix against two independent, equally noisy references.
+
+    Parameters
+    ----------
+    ours, first, second : (rows, columns, 3) float32
+    vertices, texels : (rows,), (columns,) integers
+        Where the part lies in the matrix.
+    meshes : tuple of MeshRange
+        A mesh counts by its number of vertices, however many of them were chosen.
+
+    Returns
+    -------
+    dict
+        See ``Validation.report``. The mean of (T - X)(T - Y) over elements is free of the noise of X and Y.
+    """
+    ours, first, second = (a.astype(np.float64) for a in (ours, first, second))
+    square = ((ours - first) * (ours - second)).sum(axis=2)  # [row, column]
+    norm = (first * second).sum(axis=2)
+    noise = ((first - second) ** 2).sum(axis=2) / 4  # of the mean of the two
+    plain = ((ours - (first + second) / 2) ** 2).sum(axis=2)
+    weight = np.zeros(len(vertices))  # of a row in the whole matrix
+    inside = {}
+    for mesh in meshes:
+        inside[mesh.name] = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
+        size = mesh.vertices.stop - mesh.vertices.start
+        weight[inside[mesh.name]] = size / max(1, inside[mesh.name].sum())
+    rows = _ratio(square.sum(axis=1), norm.sum(axis=1))
+    columns = _ratio(weight @ square, weight @ norm)
+    worst_row, worst_column = int(np.argmax(rows)), int(np.argmax(columns))
+
+    def total(values: NDArray[np.float64]) -> float:
+        return float(_ratio(weight @ values.sum(axis=1), weight @ norm.sum(axis=1)))
+
+    return {
+        "relative_l2": {
+            "total": total(square),
+            "meshes": {
+                name: float(_ratio(square[rows_].sum(), norm[rows_].sum())) for name, rows_ in inside.items() if rows_.any()
+            },
+        },
+        "reference_noise": total(noise),
+        "with_noise": total(plain),
+        "row_95th_percentile": float(np.percentile(rows, 95)),
+        "row_worst": {"vertex": int(vertices[worst_row]), "relative_l2": float(rows[worst_row])},
+        "column_worst": {"texel": int(texels[worst_column]), "relative_l2": float(columns[worst_column])},
+    }
+
+
+def _ratio(square: NDArray[np.float64], norm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sqrt(square / norm), 0 for a squared error below zero (noise about zero) and for 0 / 0."""
+    square = np.maximum(square, 0)
+    return np.sqrt(np.divide(square, norm, out=np.where(square > 0, 1.0, 0.0), where=norm > 0))
+
+
+def _stratified(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Sorted indices below ``count``, one at random from each of ``wanted`` stretches of equal length."""
+    if wanted >= count:
+        return np.arange(count)
+    edges = np.linspace(0, count, wanted + 1)
+    return np.floor(edges[:-1] + rng.random(wanted) * np.diff(edges)).astype(np.int64)
+
+
+def _stratified_vertices(
+    meshes: tuple[MeshRange, ...], wanted: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Vertices of every mesh, about in proportion to its size, 4 at least."""
+    total = sum(m.vertices.stop - m.vertices.start for m in meshes)
+    chosen = []
+    for mesh in meshes:
+        size = mesh.vertices.stop - mesh.vertices.start
+        chosen.append(mesh.vertices.start + _stratified(size, max(4, round(wanted * size / total)), rng))
+    return np.concatenate(chosen)
+
+
+def _direct_at_hits(
+    scene: Scene,
+    transport: LightTransport,
+    rays: VertexRays,
+    vertices: NDArray[np.int64],
+    texels: NDArray[np.int64],
+) -> dict[str, Any]:
+    """Our direct part where Mitsuba sees the vertices, against Mitsuba's; direction basis, which has no noise."""
+    lighting = transport.lighting
+    points = [sensor_points(scene, rays), vertex_points(scene)]
+    flat = np.repeat(vertices, len(texels)), np.tile(texels, len(vertices))
+    at_hits, at_vertices = (
+        DirectTransport(scene.normalised, lighting, p).elements(*flat).reshape(len(vertices), -1) for p in points
+    )
+    reference = ReferenceMatrix(scene, lighting, "direction", 2, vertices, rays).columns(texels, spp=1)
+    difference = np.abs(transport.albedo[vertices][:, None] * at_hits[..., None] - reference)
+    different = (difference > GRAZED * np.abs(reference)).any(axis=2)
+    moved = np.linalg.norm(at_hits - at_vertices) / max(float(np.linalg.norm(at_hits)), 1e-30)
+    return {"direct_at_hits": float(different.mean()), "hit_against_vertex": float(moved)}
+
+
+def _image_error(
+    scene: Scene, transport: LightTransport, environment: mi.Emitter, width: int, spp: int, seed: int
+) -> tuple[dict[str, float], Figure]:
+    """A relit image against ``path`` under the same cubemap, in two halves."""
+    lighting = transport.lighting.project(environment)
+    background = background_emitter(lighting, transport)
+    max_depth = transport.report["parameters"]["max_depth"]
+    sensor = scene.mitsuba.sensors()[0]
+    with _resized(sensor, width):
+        ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
+        halves = [
+            reference_image(scene, background, sensor, max_depth, spp // 2, seed=2 * seed + 10 + k) for k in (0, 1)
+        ]
+    reference = (halves[0] + halves[1]) / 2
+    square = float(((ours - halves[0]) * (ours - halves[1])).sum(dtype=np.float64))
+    norm = float((halves[0] * halves[1]).sum(dtype=np.float64))
+    flip_map, flip_mean, _ = flip_evaluator.evaluate(reference, ours, "HDR")
+    report = {
+        "relative_l2": float(_ratio(np.array(square), np.array(norm))),
+        "reference_noise": float(np.linalg.norm(halves[0] - halves[1]) / 2 / np.sqrt(norm)),
+        "flip": float(flip_mean),
+    }
+    return report, draw.images(ours, reference, flip_map, report)
+
+
+class _resized:
+    """Within this context a sensor's film has another width and the same shape."""
+
+    def __init__(self, sensor: mi.Sensor, width: int) -> None:
+        self._parameters = mi.traverse(sensor)
+        self._key = next(k for k in self._parameters.keys() if k.endswith("film.size"))
+        self._old = mi.ScalarVector2u(self._parameters[self._key])
+        self._new = mi.ScalarVector2u(width, max(1, round(width * self._old.y / self._old.x)))
+
+    def _set(self, size: mi.ScalarVector2u) -> None:
+        self._parameters[self._key] = size
+        self._parameters.update()
+
+    def __enter__(self) -> None:
+        self._set(self._new)
+
+    def __exit__(self, *_: object) -> None:
+        self._set(self._old)

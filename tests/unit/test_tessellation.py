@@ -1,0 +1,308 @@
+"""Triangles from shapes: grids of parametric surfaces, cleaning, subdivision."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mi_sparse_prt  # noqa: F401  chooses the variant
+from mi_sparse_prt import tessellation as ts
+from mi_sparse_prt.errors import PrtError
+
+T = mi.ScalarTransform4f
+LIMIT = 100_000
+
+
+def tetrahedron(flip: bool = False) -> ts.TriangleMesh:
+    """A closed mesh with outward faces and outward vertex normals."""
+    p = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
+    t = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32)
+    mesh = ts.TriangleMesh("tetrahedron", p, p / np.float32(np.sqrt(3)), t)
+    return ts.flipped(mesh) if flip else mesh
+
+
+def square() -> ts.TriangleMesh:
+    """The unit square in z = 0 with texture coordinates and attributes."""
+    p = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    return ts.TriangleMesh(
+        "square",
+        p,
+        np.tile(np.float32([0, 0, 1]), (4, 1)),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        p[:, :2] * np.float32([2, 3]),
+        {"vertex_color": p * np.float32(0.5)},
+        {"face_id": np.array([[1.0], [2.0]], np.float32)},
+    )
+
+
+def area(mesh: ts.TriangleMesh) -> float:
+    return float(np.linalg.norm(ts.triangle_normals(mesh), axis=1).sum() / 2)
+
+
+def volume(mesh: ts.TriangleMesh) -> float:
+    p = mesh.positions.astype(np.float64)[mesh.triangles]
+    return float(np.einsum("ij,ij->", p[:, 0], np.cross(p[:, 1], p[:, 2])) / 6)
+
+
+def welded_edge_counts(mesh: ts.TriangleMesh) -> np.ndarray:
+    """How many triangles share each edge, vertices welded by position."""
+    _, weld = np.unique(mesh.positions, axis=0, return_inverse=True)
+    t = weld.reshape(-1)[mesh.triangles]
+    edges = np.sort(np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def longest_edge(mesh: ts.TriangleMesh) -> float:
+    p = mesh.positions.astype(np.float64)[mesh.triangles]
+    return float(np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2).max())
+
+
+# --------------------------------------------------------------------------------- parametric surfaces
+
+PLACED = T().translate([1, -2, 3]).rotate([0, 0.6, 0.8], 40)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "scale"),
+    [
+        ("sphere", [0.7, 0.7, 0.7]),
+        ("sphere", [0.7, 0.7, -0.7]),
+        ("disk", [0.5, 0.5, 0.5]),
+        ("disk", [0.5, 0.8, 0.5]),
+        ("disk", [0.5, 0.5, -0.5]),
+        ("disk", [-0.5, 0.5, 0.5]),
+        ("cylinder", [0.5, 0.5, 2.0]),
+        ("cylinder", [0.5, 0.5, -2.0]),
+        ("cylinder", [-0.5, 0.5, 2.0]),
+    ],
+)
+def test_grid_lies_on_mitsubas_own_surface(shape: str, scale: list[float], flip: bool) -> None:
+    # Positions, normals and (u, v) agree with what a ray to the same point finds, mirrored or flipped.
+    from mi_sparse_prt.scene import Scene
+
+    checker = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}  # textured: (u, v) are kept
+    placed = {"type": shape, "to_world": PLACED.scale(scale), "flip_normals": flip, "bsdf": checker}
+    original = mi.load_dict({"type": "scene", "shape": placed})
+    mesh = Scene._build(original, 0.2)._surfaces[0]
+    inside = np.all((mesh.texcoords > 0.02) & (mesh.texcoords < 0.98), axis=1)  # rays may miss the very rims
+    assert inside.sum() > 50
+    p, n, uv = mesh.positions[inside], mesh.normals[inside], mesh.texcoords[inside]
+    origin, direction = (p + 0.05 * n).T.copy(), (-n).T.copy()
+    si = original.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction)))
+    np.testing.assert_allclose(np.array(si.p).T, p, atol=3e-6)
+    np.testing.assert_allclose(np.array(si.sh_frame.n).T, n, atol=3e-6)
+    np.testing.assert_allclose(np.array(si.uv).T, uv, atol=3e-5)
+    # and triangles face the way that their normals point
+    facing = np.einsum("ij,ikj->ik", ts.triangle_normals(mesh), mesh.normals[mesh.triangles])
+    assert facing.min() > 0
+
+
+@pytest.mark.parametrize("weld", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "exact"), [("sphere", 4 * np.pi), ("disk", np.pi), ("cylinder", 2 * np.pi)]
+)
+def test_grid_has_the_surfaces_area_and_no_empty_triangle(shape: str, exact: float, weld: bool) -> None:
+    mesh = ts.parametric_mesh(shape, np.eye(4), 0.05, shape, limit=LIMIT, weld=weld)
+    assert exact * (1 - 2e-3) < area(mesh) < exact  # inscribed
+    assert ts.drop_degenerate(mesh)[1] == 0
+    assert ts.drop_unreferenced(mesh)[1] == 0
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
+    counts = welded_edge_counts(mesh)
+    assert set(counts) == ({2} if shape == "sphere" else {1, 2})
+    assert (mesh.texcoords is None) == weld
+    if weld:
+        keys = np.column_stack([mesh.positions, mesh.normals]) + np.float32(0)
+        assert len(np.unique(keys, axis=0)) == len(mesh.positions)
+
+
+def test_grid_lines_are_no_further_apart_than_asked() -> None:
+    mesh = ts.parametric_mesh("sphere", np.diag([3.0, 3, 3, 1]), 0.25, "s", limit=LIMIT, weld=True)
+    assert longest_edge(mesh) <= 0.25 * np.sqrt(2) * (1 + ts.TIE)  # the cells' diagonals
+    coarse = ts.parametric_mesh("sphere", np.eye(4), np.inf, "s", limit=LIMIT)
+    assert len(coarse.positions) < 700
+
+
+def test_poles_have_texture_coordinates_of_their_own_cells() -> None:
+    mesh = ts.parametric_mesh("sphere", np.eye(4), 0.5, "s", limit=LIMIT)
+    u = mesh.texcoords[mesh.triangles][..., 0]
+    assert np.ptp(u, axis=1).max() < 0.05  # no triangle spans the seam or the circle around a pole
+
+
+def test_grid_refuses_shear_and_excess() -> None:
+    shear = np.eye(4)
+    shear[0, 1] = 0.3
+    for shape in ("sphere", "cylinder"):
+        with pytest.raises(PrtError, match=r"'odd'.*must not shear.*use a mesh"):
+            ts.parametric_mesh(shape, shear, 0.1, "odd", limit=LIMIT)
+    ts.parametric_mesh("disk", shear, 0.1, "odd", limit=LIMIT)  # Mitsuba's disk may be sheared
+    with pytest.raises(PrtError, match=r"'s'.*more than 1000 vertices.*larger edge_length"):
+        ts.parametric_mesh("sphere", np.eye(4), 0.01, "s", limit=1000)
+
+
+# ------------------------------------------------------------------------------------------ subdivision
+
+
+def test_subdivision_interpolates_positions_texture_and_attributes() -> None:
+    mesh = ts.subdivide(square(), 0.1, LIMIT)
+    assert longest_edge(mesh) <= 0.1 * (1 + ts.TIE)
+    assert area(mesh) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_array_equal(mesh.positions[:4], square().positions)  # the old vertices come first
+    np.testing.assert_allclose(mesh.texcoords, mesh.positions[:, :2] * [2, 3], atol=1e-6)
+    np.testing.assert_allclose(mesh.vertex_attributes["vertex_color"], mesh.positions * 0.5, atol=1e-6)
+    centre = mesh.positions[mesh.triangles].mean(axis=1)
+    below = centre[:, 1] < centre[:, 0]  # the square's first triangle
+    np.testing.assert_array_equal(mesh.face_attributes["face_id"][:, 0], np.where(below, 1, 2))
+    assert np.all(ts.triangle_normals(mesh)[:, 2] > 0)
+
+
+def test_subdivision_with_infinite_length_changes_nothing() -> None:
+    mesh = square()
+    assert ts.subdivide(mesh, np.inf, LIMIT) is mesh
+
+
+def test_subdivision_stops_at_the_limit() -> None:
+    with pytest.raises(PrtError, match=r"'square'.*more than 500 vertices.*larger edge_length"):
+        ts.subdivide(square(), 0.01, 500)
+
+
+def test_subdivided_normals_are_unit_and_between_their_neighbours() -> None:
+    mesh = ts.subdivide(tetrahedron(), 0.3, LIMIT)
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
+    edge_midpoint = np.flatnonzero(np.all(mesh.positions == [1, 0, 0], axis=1))  # between vertices 0 and 1
+    np.testing.assert_allclose(mesh.normals[edge_midpoint], [[1, 0, 0]], atol=1e-6)
+
+
+def test_subdivision_leaves_no_crack_between_faces_that_share_no_vertex() -> None:
+    # Faces split apart (facets): both sides of an edge must split at the same points, bit by bit.
+    facets = ts.split_by_face(tetrahedron())
+    assert len(facets.positions) == 12
+    fine = ts.subdivide(facets, 0.37, LIMIT)
+    assert set(welded_edge_counts(fine)) == {2}
+    assert volume(fine) == pytest.approx(volume(tetrahedron()), rel=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=4, max_size=4, unique=True),
+    st.floats(0.05, 1.0),
+)
+def test_subdivision_of_any_tetrahedron_is_conforming(corners: list, share: float) -> None:
+    mesh = tetrahedron()
+    mesh.positions = np.array(corners, np.float32) * np.float32(0.37)
+    if abs(volume(mesh)) < 1e-3:
+        return
+    length = share * longest_edge(mesh)
+    fine = ts.subdivide(mesh, length, LIMIT)
+    assert longest_edge(fine) <= length * (1 + ts.TIE)
+    assert set(welded_edge_counts(fine)) == {2}
+    assert area(fine) == pytest.approx(area(mesh), rel=1e-5)
+    assert volume(fine) == pytest.approx(volume(mesh), rel=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------- clean
+
+
+def test_triangles_without_area_and_unused_vertices_are_dropped() -> None:
+    mesh = square()
+    mesh.positions = np.concatenate([mesh.positions, np.float32([[9, 9, 9], [2, 0, 0]])])
+    mesh.normals = np.tile(np.float32([0, 0, 1]), (6, 1))
+    mesh.texcoords, mesh.vertex_attributes = None, {}
+    mesh.triangles = np.array([[0, 1, 2], [0, 0, 1], [0, 1, 5], [0, 2, 3]], np.int32)
+    mesh.face_attributes = {"face_id": np.arange(4, dtype=np.float32)[:, None]}
+    clean, dropped = ts.drop_degenerate(mesh)
+    assert dropped == 2
+    np.testing.assert_array_equal(clean.face_attributes["face_id"][:, 0], [0, 3])
+    clean, unused = ts.drop_unreferenced(clean)
+    assert unused == 2
+    np.testing.assert_array_equal(clean.positions[clean.triangles], square().positions[square().triangles])
+
+
+def test_thin_but_real_triangles_are_kept_at_any_scale() -> None:
+    thin = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0]])
+    for scale in (1e-6, 1.0, 1e6):
+        mesh = ts.TriangleMesh(
+            "thin", (thin * scale).astype(np.float32), None, np.array([[0, 1, 2]], np.int32)
+        )
+        assert ts.drop_degenerate(mesh)[1] == 0
+
+
+def test_bad_geometry_names_shape_and_vertex() -> None:
+    mesh = square()
+    mesh.positions = mesh.positions.copy()
+    mesh.positions[2, 1] = np.nan
+    with pytest.raises(PrtError, match=r"shape 'square': vertex 2 has a position that is not finite"):
+        ts.check_geometry(mesh)
+    mesh = square()
+    mesh.triangles = np.array([[0, 1, 2], [0, 2, 4]], np.int32)
+    with pytest.raises(PrtError, match=r"shape 'square': triangle 1 refers to a vertex outside 0..3"):
+        ts.check_geometry(mesh)
+
+
+def test_facets_have_one_normal_per_vertex_and_share_what_is_flat() -> None:
+    flat = ts.split_by_face(square())
+    assert len(flat.positions) == 4
+    facets = ts.split_by_face(tetrahedron())
+    faces = ts.triangle_normals(facets)
+    faces /= np.linalg.norm(faces, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        facets.normals[facets.triangles], np.repeat(faces[:, None], 3, axis=1), atol=1e-6
+    )
+    before, after = tetrahedron(), facets
+    np.testing.assert_array_equal(after.positions[after.triangles], before.positions[before.triangles])
+
+
+def test_angle_weighted_normals_do_not_depend_on_the_triangulation() -> None:
+    # A cube's corner gets its diagonal, although its faces are cut into one or two triangles there.
+    cube = mi.load_dict({"type": "cube"})
+    p = np.array(cube.vertex_positions_buffer()).reshape(-1, 3)
+    positions, index = np.unique(p, axis=0, return_inverse=True)
+    triangles = index.reshape(-1)[np.array(cube.faces_buffer()).reshape(-1, 3)].astype(np.int32)
+    mesh = ts.TriangleMesh("cube", positions.astype(np.float32), None, triangles)
+    normals, cancellation = ts.angle_weighted_normals(mesh)
+    np.testing.assert_allclose(normals, positions / np.sqrt(3), atol=1e-6)
+    np.testing.assert_allclose(cancellation, np.sqrt(3), atol=1e-6)
+
+
+def test_normals_computed_by_the_loader_are_settled_and_others_kept() -> None:
+    mesh = tetrahedron()
+    own, _ = ts.angle_weighted_normals(mesh)
+    loaded = own + np.float32(2e-7) * np.sign(own)  # what a parallel sum may give
+    recomputed = own.copy()
+    loaded[1] = recomputed[1] = np.nan  # a corner of a triangle without area
+    loaded[2] = [0, 1, 0]  # the file's own
+    settled = ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+    np.testing.assert_array_equal(settled.normals[[0, 1, 3]], own[[0, 1, 3]])
+    np.testing.assert_array_equal(settled.normals[2], [0, 1, 0])
+
+    loaded[3] = np.nan
+    with pytest.raises(PrtError, match=r"'tetrahedron': vertex 3 has a normal that is zero or not finite"):
+        ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+
+
+def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
+    mesh = tetrahedron()
+    mesh.normals = mesh.normals.copy()
+    mesh.normals[1] *= 3
+    mesh.normals[2] = 0
+    unit, zero = ts.with_unit_normals(mesh)
+    assert zero == 1
+    np.testing.assert_array_equal(unit.normals[[0, 3]], mesh.normals[[0, 3]])
+    np.testing.assert_allclose(unit.normals, tetrahedron().normals, atol=1e-6)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_closed_parts_that_face_inwards_are_found(flip: bool) -> None:
+    mesh = tetrahedron(flip)
+    assert ts.faces_inwards(mesh) is flip
+    assert ts.faces_inwards(ts.split_by_face(mesh)) is flip  # welded by position
+    far = tetrahedron()
+    both = ts.TriangleMesh(
+        "both",
+        np.concatenate([far.positions * 10 + 50, mesh.positions]),  # a large good part hides nothing
+        np.concatenate([far.normals, mesh.normals]),
+        np.concatenate([far.triangles, mesh.triangles + 4]),
+    )
+    assert ts.faces_inwards(both) is flip
+    assert not ts.faces_inwards(mesh.take_triangles(np.arange(3)))  # an open part may face anywhere
