@@ -144,7 +144,7 @@ def _rgb_of(bitmap: mi.Bitmap, path: Path) -> NDArray[np.float32]:
         return pixels[..., :3]
     if bitmap.pixel_format() in (formats.Y, formats.YA):
         return np.repeat(pixels[..., :1], 3, axis=2)
-    channels = ", ".join(field.name for field in bitmap.struct_())
+    channels = ", ".join(sorted(field.name for field in bitmap.struct_()))
     raise PrtError(f"{path}: has the channels {channels}; export an RGB or grey image")
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mi_sparse_prt.matrix import LightTransport, MeshRange
-from mi_sparse_prt.measurement.vertices import VertexRays, sensor_points, vertex_points, vertex_rays
+from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -90,9 +90,10 @@ def validate(
 
     Notes
     -----
-    Mitsuba sees a vertex from a ray that ends beside it. ``direct_at_hits`` is our direct part, evaluated where
-    that ray ends and with the normal there, against Mitsuba's: the share of elements that differ by more than 1e-4.
-    ``hit_against_vertex`` is what moving from vertices to hits changes in the direct part, in relative L2.
+    Mitsuba sees a vertex through a ray that ends beside it, and light that grazes an edge there may miss the vertex.
+    So the matrix is compared with its direct part moved to these hits, and what the move changes is reported
+    apart: ``hit_against_vertex``, in relative L2 of the matrix. ``direct_at_hits`` is our direct part there against
+    Mitsuba's (without noise, in the direction basis): the share of elements that differ by more than 1e-4.
     """
     transport = transport.for_scene(scene)
     rng = np.random.default_rng([seed, 2])
@@ -104,13 +105,14 @@ def validate(
     reference = ReferenceMatrix(scene, transport.lighting, transport.basis, max_depth, vertices, rays)
     halves = [reference.columns(texels, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)]
     ours = transport.rows(vertices)
-    report = matrix_errors(ours[:, texels], halves[0], halves[1], vertices, texels, transport.meshes)
+    moved, at_hits = _moved_to_hits(scene, transport, ours[:, texels], rays, vertices, texels)
+    report = matrix_errors(moved, halves[0], halves[1], vertices, texels, transport.meshes)
+    report |= at_hits
     report["estimated_error"] = transport.report.get("estimated_error")
     report["missed_vertices"] = int(rays.missed.sum())
-    report |= _direct_at_hits(scene, transport, rays, vertices, texels)
     report["parameters"] = {"rows": len(vertices), "columns": len(texels), "spp": spp, "seed": seed}
     figures = {
-        "errors": draw.errors(ours[:, texels], (halves[0] + halves[1]) / 2, vertices, transport.meshes),
+        "errors": draw.errors(moved, (halves[0] + halves[1]) / 2, vertices, transport.meshes),
         "rows": draw.rows(ours, transport.lighting, vertices),
     }
     environment = scene.mitsuba.environment()
@@ -153,8 +155,8 @@ def matrix_errors(
         inside[mesh.name] = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
         size = mesh.vertices.stop - mesh.vertices.start
         weight[inside[mesh.name]] = size / max(1, inside[mesh.name].sum())
-    rows = _ratio(square.sum(axis=1), norm.sum(axis=1))
-    columns = _ratio(weight @ square, weight @ norm)
+    rows = _ratio(square.sum(axis=1), _floored(norm.sum(axis=1)))
+    columns = _ratio(weight @ square, _floored(weight @ norm))
     worst_row, worst_column = int(np.argmax(rows)), int(np.argmax(columns))
 
     def total(values: NDArray[np.float64]) -> float:
@@ -181,6 +183,11 @@ def _ratio(square: NDArray[np.float64], norm: NDArray[np.float64]) -> NDArray[np
     return np.sqrt(np.divide(square, norm, out=np.where(square > 0, 1.0, 0.0), where=norm > 0))
 
 
+def _floored(norm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Norms of at least a thousandth of their mean: rows and columns in the dark have no relative error."""
+    return np.maximum(norm, 1e-3 * norm.mean())
+
+
 def _stratified(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Sorted indices below ``count``, one at random from each of ``wanted`` stretches of equal length."""
     if wanted >= count:
@@ -201,25 +208,33 @@ def _stratified_vertices(
     return np.concatenate(chosen)
 
 
-def _direct_at_hits(
+def _moved_to_hits(
     scene: Scene,
     transport: LightTransport,
+    ours: NDArray[np.float32],
     rays: VertexRays,
     vertices: NDArray[np.int64],
     texels: NDArray[np.int64],
-) -> dict[str, Any]:
-    """Our direct part where Mitsuba sees the vertices, against Mitsuba's; direction basis, which has no noise."""
-    lighting = transport.lighting
-    points = [sensor_points(scene, rays), vertex_points(scene)]
+) -> tuple[NDArray[np.float32], dict[str, float]]:
+    """Elements with their direct part evaluated where Mitsuba sees the vertices, and how right that part is there."""
+    lighting, parameters = transport.lighting, transport.report["parameters"]
     flat = np.repeat(vertices, len(texels)), np.tile(texels, len(vertices))
-    at_hits, at_vertices = (
-        DirectTransport(scene.normalised, lighting, p).elements(*flat).reshape(len(vertices), -1) for p in points
-    )
+    hits = sensor_points(scene, rays)
+
+    def direct(points: Points, basis: str) -> NDArray[np.float32]:
+        solver = DirectTransport(scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"])
+        white = solver.elements(*flat).reshape(len(vertices), -1, 1)
+        return transport.albedo[vertices][:, None] * white
+
+    step = direct(hits, transport.basis) - direct(vertex_points(scene), transport.basis)
     reference = ReferenceMatrix(scene, lighting, "direction", 2, vertices, rays).columns(texels, spp=1)
-    difference = np.abs(transport.albedo[vertices][:, None] * at_hits[..., None] - reference)
+    difference = np.abs(direct(hits, "direction") - reference)
     different = (difference > GRAZED * np.abs(reference)).any(axis=2)
-    moved = np.linalg.norm(at_hits - at_vertices) / max(float(np.linalg.norm(at_hits)), 1e-30)
-    return {"direct_at_hits": float(different.mean()), "hit_against_vertex": float(moved)}
+    scale = max(float(np.linalg.norm(ours)), 1e-30)
+    return ours + step, {
+        "direct_at_hits": float(different.mean()),
+        "hit_against_vertex": float(np.linalg.norm(step)) / scale,
+    }
 
 
 def _image_error(

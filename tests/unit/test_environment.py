@@ -126,7 +126,7 @@ def test_files_that_are_no_environments(tmp_path, image):
     (tmp_path / "folder.hdr").mkdir()
     (tmp_path / "short.pfm").write_bytes(b"PF\n16 8\n-1.0\nabc")
     write_bitmap(tmp_path / "cross.exr", image[:, :12])
-    channels = mi.Bitmap(image[..., :2].repeat(3, axis=2), channel_names=list("PQRSTU"))
+    channels = mi.Bitmap(image[..., :2].repeat(3, axis=2), channel_names=list("LMNOPQ"))
     channels.write(str(tmp_path / "layers.exr"))
     for name, message in {
         "missing.exr": "no such file",
@@ -135,7 +135,7 @@ def test_files_that_are_no_environments(tmp_path, image):
         "text.exr": "cannot be read as an image",
         "short.pfm": "cannot be read as an image",
         "cross.exr": "12 x 8 pixels; an equirectangular image is twice as wide as high",
-        "layers.exr": "has the channels P, Q, R, S, T, U",
+        "layers.exr": "has the channels L, M, N, O, P, Q",
     }.items():
         with pytest.raises(prt.PrtError, match=message) as error:
             prt.load_environment(tmp_path / name)
