@@ -19,12 +19,12 @@ except PrtError as _error:
 from .emission.cubemap import CubemapLighting  # noqa: E402
 from .emission.environment import Environment, load_environment  # noqa: E402
 from .matrix import LightTransport  # noqa: E402
+from .plugins import register as _register_plugins  # noqa: E402
 from .precompute import precompute  # noqa: E402
+from .relighting.image import render  # noqa: E402
 from .scene import Scene, load_scene  # noqa: E402
 from .storage import load_transport  # noqa: E402
-from .relighting.image import render  # noqa: E402
 from .validation.validate import Validation, validate  # noqa: E402
-from .plugins import register as _register_plugins  # noqa: E402
 
 _register_plugins()
 

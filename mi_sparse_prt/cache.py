@@ -24,7 +24,11 @@ def default_folder() -> Path:
 
 
 def cached_precompute(
-    scene: Scene, lighting: CubemapLighting, folder: Path | None = None, progress: bool = True, **settings: Any
+    scene: Scene,
+    lighting: CubemapLighting,
+    folder: Path | None = None,
+    progress: bool = True,
+    **settings: Any,
 ) -> LightTransport:
     """``precompute``, or the matrix that an earlier call left in a folder.
 
@@ -40,7 +44,8 @@ def cached_precompute(
         shapes is not part of it.
     """
     key = json.dumps(
-        [VERSION, scene.hash, lighting.resolution, asdict(checked_settings(lighting, **settings))], sort_keys=True
+        [VERSION, scene.hash, lighting.resolution, asdict(checked_settings(lighting, **settings))],
+        sort_keys=True,
     )
     folder = folder or default_folder()
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.prt"

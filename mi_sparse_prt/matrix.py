@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
 
@@ -181,7 +182,9 @@ class Indirect:
         weights = self.upsampling[np.asarray(ids)].multiply(self.lighting.solid_angles[ids][:, None]).tocsr()
         needed = np.unique(weights.indices)
         density = self.density[:, needed].astype(np.float32)  # [vertex, needed coarse, channel]
-        return np.stack([(weights[:, needed] @ density[..., c].T).T for c in range(density.shape[2])], axis=-1)
+        return np.stack(
+            [(weights[:, needed] @ density[..., c].T).T for c in range(density.shape[2])], axis=-1
+        )
 
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
         coarse = self.upsampling.T @ (lighting * self.lighting.solid_angles[:, None])  # [coarse, rgb]
@@ -223,7 +226,7 @@ class LightTransport:
         White parts; None where there is no such light.
     meshes : tuple of MeshRange
     vertex_keys : (n_v,) uint64
-        Identify vertices whatever their order (see ``Scene.vertex_keys``).
+        Identify rows whatever their order (``Points.keys``).
     scene_hash : str
     report : dict
         What was done, skipped, how long it took and how good it is; JSON as it is.
@@ -327,17 +330,21 @@ class LightTransport:
                 f"this matrix belongs to another scene than {scene.path or 'the one given'} "
                 "(geometry or materials differ); precompute it again"
             )
-        if np.array_equal(self.vertex_keys, scene.vertex_keys):
+        keys = vertex_points(scene).keys
+        if np.array_equal(self.vertex_keys, keys):
             return self
-        source = np.empty(len(self.vertex_keys), dtype=np.int64)
-        source[np.argsort(scene.vertex_keys, kind="stable")] = np.argsort(self.vertex_keys, kind="stable")
+        ours, theirs = (np.argsort(k, kind="stable") for k in (self.vertex_keys, keys))
+        if not np.array_equal(self.vertex_keys[ours], keys[theirs]):
+            raise PrtError("this matrix belongs to other vertices of the same scene; precompute it again")
+        source = np.empty_like(ours)
+        source[theirs] = ours
         return replace(
             self,
             albedo=self.albedo[source],
             direct=self.direct.reordered(source),
             indirect=self.indirect and self.indirect.reordered(source),
             meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-            vertex_keys=scene.vertex_keys,
+            vertex_keys=keys,
         )
 
     def save(self, path: str | Path) -> None:

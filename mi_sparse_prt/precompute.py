@@ -109,15 +109,19 @@ def precompute(
     forecast = _forecast(direct, indirect, clock, progress)
 
     with clock.phase("direct"):
-        stored = _trace(direct, direct.row_storage(len(points)), lambda ids: direct.rows(ids), "direct", progress)
+        stored = _trace(
+            direct, direct.row_storage(len(points)), lambda ids: direct.rows(ids), "direct", progress
+        )
     transport = LightTransport(
         lighting=lighting,
         basis=basis,
         albedo=scene.albedo,
-        direct=Visibility(stored, scene.normals, lighting) if basis == "direction" else MeanCosine(stored, lighting),
+        direct=Visibility(stored, scene.normals, lighting)
+        if basis == "direction"
+        else MeanCosine(stored, lighting),
         indirect=_indirect_part(indirect, lighting, clock, progress) if indirect else None,
         meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-        vertex_keys=scene.vertex_keys,
+        vertex_keys=points.keys,
         scene_hash=scene.hash,
     )
     with clock.phase("held_out"):
@@ -141,7 +145,12 @@ def precompute(
             "forecast": forecast,
             "seed": settings.seed,
             "parameters": {"resolution": lighting.resolution, **asdict(settings)},
-            "scene": {"path": scene.path, "hash": scene.hash, "vertices": len(points), "warnings": scene.warnings},
+            "scene": {
+                "path": scene.path,
+                "hash": scene.hash,
+                "vertices": len(points),
+                "warnings": scene.warnings,
+            },
             "versions": _versions(),
         }
     )
@@ -219,7 +228,9 @@ def _indirect_solver(
         1 if scene.grey else 3,
         settings.seed,
     )
-    return solver, ["two of three channels of the indirect light: every surface is grey"] if scene.grey else []
+    return solver, [
+        "two of three channels of the indirect light: every surface is grey"
+    ] if scene.grey else []
 
 
 def _indirect_part(
@@ -266,7 +277,9 @@ def _forecast(
     solvers = [direct, indirect] if indirect else [direct]
     seconds = n * sum(_seconds_per_row(solver, clock) for solver in solvers)
     if progress:
-        tqdm.write(f"{n} vertices x {n_directions} directions: about {seconds:.0f} s and {n * row / 1e6:.0f} MB")
+        tqdm.write(
+            f"{n} vertices x {n_directions} directions: about {seconds:.0f} s and {n * row / 1e6:.0f} MB"
+        )
     return {"seconds": seconds, "bytes": float(n * row)}
 
 
@@ -309,4 +322,7 @@ def _peak_memory() -> int:
 
 def _versions() -> dict[str, str]:
     names = ("mi-sparse-prt", "mitsuba", "drjit", "numpy")
-    return {name: version(name) for name in names} | {"python": platform.python_version(), "variant": mi.variant()}
+    return {name: version(name) for name in names} | {
+        "python": platform.python_version(),
+        "variant": mi.variant(),
+    }

@@ -79,7 +79,9 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
     """
     path = Path(path)
     if not path.is_file():
-        raise PrtError(f"no such matrix file: {path}; make it with `mi-sparse-prt precompute SCENE -o {path}`")
+        raise PrtError(
+            f"no such matrix file: {path}; make it with `mi-sparse-prt precompute SCENE -o {path}`"
+        )
     broken = f"{path} is damaged or not a matrix file of mi_sparse_prt; precompute it again"
     try:
         store = zarr.storage.ZipStore(path, mode="r")
@@ -96,8 +98,19 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
         transport = _assemble(attributes, arrays)
     except PrtError:
         raise
-    except (OSError, zipfile.BadZipFile, zlib.error, KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
-        raise PrtError(f"{broken} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})") from None
+    except (
+        OSError,
+        zipfile.BadZipFile,
+        zlib.error,
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:
+        raise PrtError(
+            f"{broken} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})"
+        ) from None
     return transport if scene is None else transport.for_scene(scene)
 
 

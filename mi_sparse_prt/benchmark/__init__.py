@@ -18,7 +18,9 @@ from mi_sparse_prt.scene import Scene
 FEWEST_REPEATS = 3
 
 
-def run_benchmark(scene: Scene, lighting: CubemapLighting, repeats: int = 3, progress: bool = True) -> dict[str, Any]:
+def run_benchmark(
+    scene: Scene, lighting: CubemapLighting, repeats: int = 3, progress: bool = True
+) -> dict[str, Any]:
     """Measure the direct matrix, indirect paths and relighting of a scene.
 
     Parameters

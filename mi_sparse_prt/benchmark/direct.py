@@ -80,7 +80,7 @@ def measure_direct(
     solver = DirectTransport(scene.normalised, lighting, points)
     bare = BareOcclusion(scene.normalised, lighting, points)
     blocks = [(a, min(a + solver.block_size, len(points))) for a in range(0, len(points), solver.block_size)]
-    bits = solver.row_storage(len(points))
+    bits = solver.row_storage(len(points)).astype(np.uint32, copy=False)  # a fact, told to mypy
 
     def fill(start: int, stop: int) -> None:
         bits[start:stop] = solver.rows(np.arange(start, stop, dtype=np.uint32))
@@ -115,9 +115,7 @@ def measure_direct(
     }, bits
 
 
-def _alternating(
-    ours: Any, bare: Any, blocks: list[tuple[int, int]], repeat: int
-) -> tuple[float, float]:
+def _alternating(ours: Any, bare: Any, blocks: list[tuple[int, int]], repeat: int) -> tuple[float, float]:
     """Seconds of two ways to do the same blocks, in turn."""
     seconds = [0.0, 0.0]
     for k, block in enumerate(blocks):

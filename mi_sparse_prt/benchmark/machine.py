@@ -20,7 +20,9 @@ def describe_machine() -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "drjit_threads": dr.thread_count(),
         "memory_bytes": psutil.virtual_memory().total,
-        "load_average": os.getloadavg()[0],  # above the number of cores: others were working, times are too long
+        "load_average": os.getloadavg()[
+            0
+        ],  # above the number of cores: others were working, times are too long
         "system": platform.platform(),
         "versions": _versions(),
     }
@@ -31,4 +33,6 @@ def _cpu_model() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:  # not Linux
         return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return next(
+        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine()
+    )

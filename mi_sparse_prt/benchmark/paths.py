@@ -31,8 +31,8 @@ def measure_paths(scene: Scene, lighting: CubemapLighting, repeats: int) -> dict
     Returns
     -------
     dict
-        ``max_depth``, ``spp``, ``channels``, ``paths`` (per repeat), and for each of ``rows`` and ``scattered``:
-        ``paths_per_second`` (median), ``seconds`` per repeat, ``first_run_seconds`` (compilation included; scattered
+        ``max_depth``, ``spp``, ``channels``, ``paths`` and ``blocks`` (of one repeat), and for each of ``rows`` and
+        ``scattered``: ``paths_per_second`` (median), ``seconds`` per repeat, ``first_run_seconds`` (compilation included; scattered
         elements find the kernel of the rows) and ``kernels`` of that run. ``whole_matrix_seconds`` is what all rows
         would take.
     """
@@ -51,11 +51,21 @@ def measure_paths(scene: Scene, lighting: CubemapLighting, repeats: int) -> dict
         "rows": lambda: solver.rows(rows),
         "scattered": lambda: solver.elements(vertices, texels),
     }
-    report: dict[str, Any] = {"max_depth": MAX_DEPTH, "spp": SPP, "channels": channels, "paths": n_elements * SPP}
+    report: dict[str, Any] = {
+        "max_depth": MAX_DEPTH,
+        "spp": SPP,
+        "channels": channels,
+        "paths": n_elements * SPP,
+    }
+    report["blocks"] = -(-n_elements * SPP // LANES)
     for name, way in ways.items():
         start = time.perf_counter()
         kernels = kernels_of(way)
-        report[name] = {"first_run_seconds": time.perf_counter() - start, "kernels": kernels.report(), "seconds": []}
+        report[name] = {
+            "first_run_seconds": time.perf_counter() - start,
+            "kernels": kernels.report(),
+            "seconds": [],
+        }
     for _ in range(repeats):
         for name, way in ways.items():
             start = time.perf_counter()

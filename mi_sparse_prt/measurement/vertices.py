@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.hashing import hash_rows
 from mi_sparse_prt.scene import Scene
 
 # A Mitsuba ray reaches a vertex from just above one of its triangles: this far from the corner towards the
@@ -33,7 +34,7 @@ class Points:
         is the shading normal, so that every direction above the horizon starts on the outside; at a sensor's hit it
         is the geometric normal, as in Mitsuba's ``spawn_ray``.
     keys : (n,) uint64, what random numbers are derived from: the same point gets the same random numbers in any
-        order and in any block.
+        order and in any block, and is the same row of a matrix.
     """
 
     positions: NDArray[np.float32]
@@ -54,16 +55,32 @@ def vertex_points(scene: Scene) -> Points:
     """
     positions = scene.normalised_positions
     triangles = np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
-    border = _border_vertices(triangles)
-    owners, rank, corners = _triangles_of_vertices(positions, triangles)
-    chosen = (rank == 0) & border[owners]
-    ids, face = owners[chosen], corners[chosen] // 3
-    inwards = positions[triangles[face]].astype(np.float64).mean(axis=1) - positions[ids]  # [border vertex, xyz]
-    length = np.linalg.norm(inwards, axis=1, keepdims=True)
-    offset = _BORDER_OFFSETS * float(mi.math.RayEpsilon) * (1 + np.abs(positions[ids]).max(axis=1, keepdims=True))
+    border = np.flatnonzero(_border_vertices(triangles))
+    centre = _mean_of_triangles(positions, triangles)[border]
+    inwards = centre - positions[border]  # [border vertex, xyz]
+    length = np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-30)
+    offset = (
+        _BORDER_OFFSETS
+        * float(mi.math.RayEpsilon)
+        * (1 + np.abs(positions[border]).max(axis=1, keepdims=True))
+    )
     moved = positions.copy()
-    moved[ids] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
-    return Points(moved, scene.normals, scene.normals, scene.vertex_keys)
+    moved[border] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
+    # two vertices may differ only in the side to which they moved: where two meshes meet
+    return Points(moved, scene.normals, scene.normals, hash_rows(moved, scene.vertex_keys))
+
+
+def _mean_of_triangles(positions: NDArray[np.float32], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Mean of the centroids of every vertex's triangles, (n_v, 3).
+
+    Sums of float32 in float64 are exact here, so the order of triangles and corners does not show.
+    """
+    sums = positions.astype(np.float64)[triangles].sum(axis=1)  # [triangle, xyz]
+    total, count = np.zeros(positions.shape), np.zeros(len(positions))
+    for corner in range(3):
+        np.add.at(total, triangles[:, corner], sums)
+        np.add.at(count, triangles[:, corner], 1)
+    return total / (3 * np.maximum(count, 1))[:, None]
 
 
 def _border_vertices(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -63,7 +63,8 @@ class MeshVertices(mi.Sensor):
         self._size = self.film().size()
         if self._size.x * self._size.y < self._vertices:
             raise PrtError(
-                f"mesh_vertices: a film of {self._size.x} x {self._size.y} pixels is too small for {self._vertices} vertices"
+                f"mesh_vertices: a film of {self._size.x} x {self._size.y} pixels is too small "
+                f"for {self._vertices} vertices"
             )
         if self.film().rfilter().radius() > 0.5 + 1e-6:
             raise PrtError("mesh_vertices: the film's filter mixes vertices; set <rfilter type='box'/>")
@@ -91,7 +92,9 @@ class MeshVertices(mi.Sensor):
         """
         rays = rays or vertex_rays(scene)
         if len(rays.origins) != self._vertices:
-            raise PrtError(f"mesh_vertices: made for {self._vertices} vertices, but there are {len(rays.origins)}")
+            raise PrtError(
+                f"mesh_vertices: made for {self._vertices} vertices, but there are {len(rays.origins)}"
+            )
         self._origins, self._directions = mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T)
         dr.eval(self._origins, self._directions)
         return rays
@@ -106,9 +109,12 @@ class MeshVertices(mi.Sensor):
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """The ray of the pixel at a film position in [0, 1]^2; pixels beyond the last vertex see nothing."""
         if self._origins is None:
-            raise PrtError("mesh_vertices: not bound to a scene; call scene.sensors()[0].bind(scene) before rendering")
+            raise PrtError(
+                "mesh_vertices: not bound to a scene; call scene.sensors()[0].bind(scene) before rendering"
+            )
         column, row = (
-            dr.clip(mi.UInt32(position_sample[axis] * self._size[axis]), 0, self._size[axis] - 1) for axis in (0, 1)
+            dr.clip(mi.UInt32(position_sample[axis] * self._size[axis]), 0, self._size[axis] - 1)
+            for axis in (0, 1)
         )
         vertex = row * self._size.x + column
         active = mi.Mask(active) & (vertex < self._vertices)

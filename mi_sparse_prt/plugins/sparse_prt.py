@@ -98,7 +98,9 @@ class SparsePRT(mi.SamplingIntegrator):
             return self._reference.render(scene, sensor, seed, spp, develop, evaluate)
         environment = scene.environment()
         if environment is None:
-            raise PrtError("sparse_prt: the scene has no environment; add an emitter envmap, constant or cubemap")
+            raise PrtError(
+                "sparse_prt: the scene has no environment; add an emitter envmap, constant or cubemap"
+            )
         if len(scene.emitters()) > 1:
             warnings.warn(
                 "sparse_prt: only the environment lights the scene, its other emitters are left out",

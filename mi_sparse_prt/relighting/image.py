@@ -47,11 +47,16 @@ class RelitScene:
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
         irradiance, albedo = (
-            sum(w * dr.gather(mi.Color3f, values, i, valid) for w, i in zip((1 - u - v, u, v), vertices, strict=True))
+            sum(
+                w * dr.gather(mi.Color3f, values, i, valid)
+                for w, i in zip((1 - u - v, u, v), vertices, strict=True)
+            )
             for values in (self._irradiance, self._albedo)
         )
         bsdf = si.bsdf()
-        diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(
+            bsdf.flags(), mi.BSDFFlags.Delta
+        )
         textured = bsdf.eval_diffuse_reflectance(si, valid)
         front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
         value = dr.select(front, irradiance * dr.select(diffuse, textured, albedo), 0)
@@ -114,7 +119,9 @@ def render(
     if isinstance(sensor, int):
         sensors = scene.mitsuba.sensors()
         if not -len(sensors) <= sensor < len(sensors):
-            raise PrtError(f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}")
+            raise PrtError(
+                f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
+            )
         sensor = sensors[sensor]
     irradiance = transport.for_scene(scene).irradiance(environment)
     relit = RelitScene(scene, irradiance, background_emitter(environment, transport))
@@ -122,7 +129,9 @@ def render(
     return np.array(image)[..., :3]
 
 
-def background_emitter(environment: Environment | mi.Emitter | ArrayLike, transport: LightTransport) -> mi.Emitter:
+def background_emitter(
+    environment: Environment | mi.Emitter | ArrayLike, transport: LightTransport
+) -> mi.Emitter:
     """An environment as a Mitsuba emitter: an image as ``envmap``, texel values as ``cubemap``."""
     if isinstance(environment, mi.Emitter):
         return environment

@@ -110,7 +110,9 @@ class DirectTransport:
             else:
                 element, stratum = self._lanes(len(texels))
                 point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
-                cosine[part] = self._mean_cosine(point, texel, stratum, self.seed if seed is None else seed).numpy()
+                cosine[part] = self._mean_cosine(
+                    point, texel, stratum, self.seed if seed is None else seed
+                ).numpy()
         return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
 
     def _lanes(self, n_elements: int) -> tuple[mi.UInt32, mi.UInt32]:
@@ -128,9 +130,7 @@ class DirectTransport:
         """Directions rounded up to whole words of bits."""
         return -(-self._n_texels // BITS) * BITS
 
-    def _trace(
-        self, point: mi.UInt32, direction: mi.Vector3f, active: mi.Mask
-    ) -> tuple[mi.Mask, mi.Float]:
+    def _trace(self, point: mi.UInt32, direction: mi.Vector3f, active: mi.Mask) -> tuple[mi.Mask, mi.Float]:
         """Which points see the sky in a direction, and the cosine. Below the horizon no ray is traced."""
         cosine = dr.dot(self._points.normal(point), direction)
         active &= cosine > 0

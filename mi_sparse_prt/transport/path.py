@@ -75,7 +75,9 @@ class PathTransport:
         """Whether any of a few cosine-distributed rays per point meets a surface."""
         lane = dr.arange(mi.UInt32, len(self.points) * rays_per_point)
         point = lane // rays_per_point
-        rng = random_generator(self._points.key(point), mi.UInt32(0), lane - point * rays_per_point, self.seed)
+        rng = random_generator(
+            self._points.key(point), mi.UInt32(0), lane - point * rays_per_point, self.seed
+        )
         return bool(dr.any(self.scene.ray_test(self._first_ray(point, rng))))
 
     def rows(self, point_ids: NDArray[np.integer]) -> Estimate:
@@ -174,9 +176,7 @@ def _has_mirrors(scene: mi.Scene) -> bool:
 
 
 @dr.syntax
-def _reflected(
-    scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
-) -> mi.Color3f:
+def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32) -> mi.Color3f:
     """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
 
     Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most.

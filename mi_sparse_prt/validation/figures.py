@@ -51,7 +51,12 @@ def errors(
     for mesh in meshes:
         inside = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
         left.plot(vertices[inside], relative[inside], ".", label=mesh.name)
-    left.set(xlabel="vertex", ylabel="relative L2 of its row", yscale="log", title="rows, with the reference's noise")
+    left.set(
+        xlabel="vertex",
+        ylabel="relative L2 of its row",
+        yscale="log",
+        title="rows, with the reference's noise",
+    )
     left.legend()
     right.plot(reference.ravel(), ours.ravel(), ".", markersize=1, rasterized=True)
     top = float(reference.max(initial=0)) or 1.0
@@ -61,7 +66,10 @@ def errors(
 
 
 def images(
-    ours: NDArray[np.float32], reference: NDArray[np.float32], flip: NDArray[np.float32], report: dict[str, float]
+    ours: NDArray[np.float32],
+    reference: NDArray[np.float32],
+    flip: NDArray[np.float32],
+    report: dict[str, float],
 ) -> Figure:
     """Relit image, Mitsuba's image and their FLIP difference."""
     figure = Figure(figsize=(15, 4.2), layout="constrained")

@@ -48,8 +48,12 @@ def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed
     for mesh in scene.meshes:
         n = mesh.vertices.stop - mesh.vertices.start
         vertices = np.sort(rng.choice(n, min(n, VERTICES), replace=False)) + mesh.vertices.start
-        texels = np.stack([rng.choice(n_directions, min(n_directions, TEXELS), replace=False) for _ in vertices])
-        error, norm = _products(scene, transport, max_depth, seed, vertices, texels)  # [vertex], means over texels
+        texels = np.stack(
+            [rng.choice(n_directions, min(n_directions, TEXELS), replace=False) for _ in vertices]
+        )
+        error, norm = _products(
+            scene, transport, max_depth, seed, vertices, texels
+        )  # [vertex], means over texels
         count += texels.size
         squares[mesh.name], norms[mesh.name] = n * error.mean(), n * norm.mean()
         spreads[mesh.name] = n * error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else 0.0
@@ -100,7 +104,9 @@ def _white_elements(
     white = np.repeat(direct.elements(vertices, texels)[:, None].astype(np.float64), 3, axis=1)
     if transport.indirect is not None:
         channels = transport.indirect.density.shape[2]
-        path = PathTransport(scene.normalised, lighting, points, transport.basis, max_depth, SPP, channels, seed)
+        path = PathTransport(
+            scene.normalised, lighting, points, transport.basis, max_depth, SPP, channels, seed
+        )
         white += path.elements(vertices, texels).mean * lighting.solid_angles[texels][:, None]
     return white
 

@@ -103,7 +103,9 @@ def validate(
     max_depth = transport.report["parameters"]["max_depth"]
 
     reference = ReferenceMatrix(scene, transport.lighting, transport.basis, max_depth, vertices, rays)
-    halves = [reference.columns(texels, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)]
+    halves = [
+        reference.columns(texels, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)
+    ]
     ours = transport.rows(vertices)
     moved, at_hits = _moved_to_hits(scene, transport, ours[:, texels], rays, vertices, texels)
     report = matrix_errors(moved, halves[0], halves[1], vertices, texels, transport.meshes)
@@ -117,7 +119,9 @@ def validate(
     }
     environment = scene.mitsuba.environment()
     if image and environment is not None and scene.mitsuba.sensors():
-        report["image"], figures["image"] = _image_error(scene, transport, environment, image_width, image_spp, seed)
+        report["image"], figures["image"] = _image_error(
+            scene, transport, environment, image_width, image_spp, seed
+        )
     return Validation(report, figures)
 
 
@@ -166,7 +170,9 @@ def matrix_errors(
         "relative_l2": {
             "total": total(square),
             "meshes": {
-                name: float(_ratio(square[rows_].sum(), norm[rows_].sum())) for name, rows_ in inside.items() if rows_.any()
+                name: float(_ratio(square[rows_].sum(), norm[rows_].sum()))
+                for name, rows_ in inside.items()
+                if rows_.any()
             },
         },
         "reference_noise": total(noise),
@@ -222,7 +228,9 @@ def _moved_to_hits(
     hits = sensor_points(scene, rays)
 
     def direct(points: Points, basis: str) -> NDArray[np.float32]:
-        solver = DirectTransport(scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"])
+        solver = DirectTransport(
+            scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"]
+        )
         white = solver.elements(*flat).reshape(len(vertices), -1, 1)
         return transport.albedo[vertices][:, None] * white
 
@@ -248,7 +256,8 @@ def _image_error(
     with _resized(sensor, width):
         ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
         halves = [
-            reference_image(scene, background, sensor, max_depth, spp // 2, seed=2 * seed + 10 + k) for k in (0, 1)
+            reference_image(scene, background, sensor, max_depth, spp // 2, seed=2 * seed + 10 + k)
+            for k in (0, 1)
         ]
     reference = (halves[0] + halves[1]) / 2
     square = float(((ours - halves[0]) * (ours - halves[1])).sum(dtype=np.float64))
