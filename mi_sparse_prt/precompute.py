@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import platform
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.planner import IndirectPlan, plan_indirect
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.held_out import held_out_error
+from mi_sparse_prt.validation.held_out import HeldOut
 
 METHODS = ("brute_force",)
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
@@ -52,6 +54,7 @@ def precompute(
     basis: str = "direction",
     max_depth: int = 5,
     spp: int = 16,
+    target_error: float | None = None,
     seed: int = 0,
     progress: bool = True,
     *,
@@ -73,6 +76,10 @@ def precompute(
         As Mitsuba's ``path``: 2 = direct light only, 5 = three interreflections, -1 = until Russian roulette ends it.
     spp : int
         Paths per indirect element.
+    target_error : float, optional
+        Relative L2 error of the whole matrix to aim at. A pilot on a few vertices then chooses the cheapest
+        ``indirect_resolution`` and ``spp`` (see ``planner``), in place of those given; a warning says if the
+        held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices.
     progress : bool
@@ -95,10 +102,27 @@ def precompute(
     PrtError
         If an argument makes no sense, or the matrix would not fit into memory.
     """
-    settings = checked_settings(lighting, method, basis, max_depth, spp, seed, indirect_resolution, strata)
+    settings = checked_settings(
+        lighting,
+        method=method,
+        basis=basis,
+        max_depth=max_depth,
+        spp=spp,
+        target_error=target_error,
+        seed=seed,
+        indirect_resolution=indirect_resolution,
+        strata=strata,
+    )
     _reset_peak_memory()
     clock = Stopwatch()
     points = vertex_points(scene)
+    plans: list[IndirectPlan] = []
+    if target_error is not None and _may_be_indirect(scene, settings) is None:
+        with clock.phase("plan"):
+            plans = plan_indirect(
+                scene, lighting, basis, max_depth, settings.strata, settings.seed, target_error
+            )
+        settings = replace(settings, spp=plans[0].spp, indirect_resolution=plans[0].resolution)
     direct = DirectTransport(scene.normalised, lighting, points, basis, settings.strata, settings.seed)
     indirect, skipped = _indirect_solver(scene, lighting, settings)
     if indirect:
@@ -125,7 +149,15 @@ def precompute(
         scene_hash=scene.hash,
     )
     with clock.phase("held_out"):
-        error = held_out_error(scene, transport, settings.max_depth, settings.seed)
+        held = HeldOut(scene, lighting, basis, max_depth, indirect is not None, settings.seed)
+        elements = np.take_along_axis(transport.rows(held.vertices), held.texels[..., None], axis=1)
+        error = held.error(elements)
+    if target_error is not None and error["total"] - 2 * error["standard_error"]["total"] > target_error:
+        warnings.warn(
+            f"the target error {target_error:g} was not met: the estimate is {error['total']:.3g}",
+            PrtWarning,
+            stacklevel=2,
+        )
 
     above = _share_above_horizon(scene.normals, lighting)
     skipped.append(f"direct rays below the horizon: {1 - above:.0%} of the elements")
@@ -139,6 +171,8 @@ def precompute(
             "elements_evaluated": len(points) * lighting.n_directions,
             "rays": rays,
             "estimated_error": error,
+            "target_error": target_error,
+            "plans": [plan.report() for plan in plans],
             "skipped": skipped,
             "stored_bytes": transport.nbytes,
             "peak_memory_bytes": _peak_memory(),
@@ -159,13 +193,15 @@ def precompute(
 
 def checked_settings(
     lighting: CubemapLighting,
-    method: str,
-    basis: str,
-    max_depth: int,
-    spp: int,
-    seed: int,
-    indirect_resolution: int | None,
-    strata: int,
+    *,
+    method: str = "brute_force",
+    basis: str = "direction",
+    max_depth: int = 5,
+    spp: int = 16,
+    target_error: float | None = None,
+    seed: int = 0,
+    indirect_resolution: int | None = None,
+    strata: int = 2,
 ) -> Settings:
     """Check the arguments of ``precompute`` (see there for the meaning and the errors)."""
     if method not in METHODS:
@@ -174,6 +210,8 @@ def checked_settings(
         raise PrtError(f"unknown basis {basis!r}; choose 'direction' or 'texel'")
     if max_depth < 2 and max_depth != -1:
         raise PrtError(f"max_depth is {max_depth}; 2 is direct light only, -1 is no limit")
+    if target_error is not None and not target_error > 0:
+        raise PrtError(f"target_error is {target_error}; it must be positive, 0.02 for 2%")
     for name, value in (("spp", spp), ("strata", strata)):
         if value < 1 or value != int(value):
             raise PrtError(f"{name} is {value}; it must be a whole number of at least 1")
@@ -209,14 +247,22 @@ class Stopwatch:
         return {**phases, "total": elapsed - compiling, "compile": compiling}
 
 
+def _may_be_indirect(scene: Scene, settings: Settings) -> str | None:
+    """Why there is no indirect light for sure, or None."""
+    if settings.max_depth == 2:
+        return "max_depth 2 asks for direct light only"
+    if scene.diffuse and not scene.albedo.any():
+        return "every surface is black"
+    return None
+
+
 def _indirect_solver(
     scene: Scene, lighting: CubemapLighting, settings: Settings
 ) -> tuple[PathTransport | None, list[str]]:
     """The solver for indirect light if any can arrive, and what is skipped."""
-    if settings.max_depth == 2:
-        return None, ["indirect light: max_depth 2 asks for direct light only"]
-    if scene.diffuse and not scene.albedo.any():
-        return None, ["indirect light: every surface is black"]
+    reason = _may_be_indirect(scene, settings)
+    if reason:
+        return None, [f"indirect light: {reason}"]
     solver = PathTransport(
         scene.normalised,
         CubemapLighting(settings.indirect_resolution),
@@ -274,7 +320,7 @@ def _forecast(
             f"the matrix needs {n * row / 1e9:.1f} GB but {available / 1e9:.1f} GB are free; "
             "lower the resolution of the lighting or of the indirect light"
         )
-    solvers = [direct, indirect] if indirect else [direct]
+    solvers: list[DirectTransport | PathTransport] = [direct, indirect] if indirect else [direct]
     seconds = n * sum(_seconds_per_row(solver, clock) for solver in solvers)
     if progress:
         tqdm.write(

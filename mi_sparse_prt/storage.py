@@ -25,6 +25,8 @@ from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 1
 _VERTEX_CHUNK = 4096
+# what Zarr, zip and our own assembly raise when a file is not what it should be
+_DAMAGE = (OSError, zipfile.BadZipFile, zlib.error, LookupError, TypeError, ValueError, RuntimeError)
 
 
 def save(transport: LightTransport, path: str | Path) -> None:
@@ -56,7 +58,8 @@ def save(transport: LightTransport, path: str | Path) -> None:
         temporary = None
     except OSError as error:
         raise PrtError(
-            f"cannot write {path}: {error.strerror or error}; nothing was left behind, free some space or choose another folder"
+            f"cannot write {path}: {error.strerror or error}; nothing was left behind, "
+            "free some space or choose another folder"
         ) from None
     finally:
         if temporary:
@@ -87,7 +90,7 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
         store = zarr.storage.ZipStore(path, mode="r")
         try:
             group = zarr.open_group(store, mode="r")
-            attributes = dict(group.attrs)
+            attributes: dict[str, Any] = dict(group.attrs)
             if attributes.get("format") != FORMAT:
                 raise PrtError(broken)
             if attributes["version"] > VERSION:
@@ -98,19 +101,8 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
         transport = _assemble(attributes, arrays)
     except PrtError:
         raise
-    except (
-        OSError,
-        zipfile.BadZipFile,
-        zlib.error,
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        RuntimeError,
-    ) as error:
-        raise PrtError(
-            f"{broken} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})"
-        ) from None
+    except _DAMAGE as error:
+        raise PrtError(f"{broken} ({' '.join(str(error).split()) or type(error).__name__})") from None
     return transport if scene is None else transport.for_scene(scene)
 
 

@@ -32,9 +32,9 @@ def measure_paths(scene: Scene, lighting: CubemapLighting, repeats: int) -> dict
     -------
     dict
         ``max_depth``, ``spp``, ``channels``, ``paths`` and ``blocks`` (of one repeat), and for each of ``rows`` and
-        ``scattered``: ``paths_per_second`` (median), ``seconds`` per repeat, ``first_run_seconds`` (compilation included; scattered
-        elements find the kernel of the rows) and ``kernels`` of that run. ``whole_matrix_seconds`` is what all rows
-        would take.
+        ``scattered``: ``paths_per_second`` (median), ``seconds`` per repeat, ``first_run_seconds`` (compilation
+        included; scattered elements find the kernel of the rows) and ``kernels`` of that run.
+        ``whole_matrix_seconds`` is what all rows would take.
     """
     points = vertex_points(scene)
     channels = 1 if scene.grey else 3

@@ -131,7 +131,7 @@ class PathTransport:
         mean = np.stack([x.numpy() for x in sums], axis=-1) / self.spp
         second = np.stack([x.numpy() for x in squares], axis=-1) / self.spp
         variance = np.maximum(second - mean**2, 0) / max(self.spp - 1, 1)
-        return Estimate(mean, variance)
+        return Estimate(mean.astype(np.float32), variance.astype(np.float32))
 
     def _first_ray(self, point: mi.UInt32, rng: mi.PCG32) -> mi.Ray3f:
         """Cosine-distributed about the shading normal."""

@@ -23,7 +23,7 @@ def unfolded(texels: NDArray[np.floating], lighting: CubemapLighting) -> NDArray
 
 
 def rows(
-    values: NDArray[np.float32], lighting: CubemapLighting, vertices: NDArray[np.integer], count: int = 4
+    values: NDArray[np.floating], lighting: CubemapLighting, vertices: NDArray[np.integer], count: int = 4
 ) -> Figure:
     """A few rows of T as unfolded cubemaps: where each vertex gets its light from."""
     chosen = np.linspace(0, len(vertices) - 1, min(count, len(vertices))).astype(int)
@@ -38,8 +38,8 @@ def rows(
 
 
 def errors(
-    ours: NDArray[np.float32],
-    reference: NDArray[np.float32],
+    ours: NDArray[np.floating],
+    reference: NDArray[np.floating],
     vertices: NDArray[np.integer],
     meshes: tuple[MeshRange, ...],
 ) -> Figure:
@@ -66,9 +66,9 @@ def errors(
 
 
 def images(
-    ours: NDArray[np.float32],
-    reference: NDArray[np.float32],
-    flip: NDArray[np.float32],
+    ours: NDArray[np.floating],
+    reference: NDArray[np.floating],
+    flip: NDArray[np.floating],
     report: dict[str, float],
 ) -> Figure:
     """Relit image, Mitsuba's image and their FLIP difference."""
@@ -85,7 +85,7 @@ def images(
     return figure
 
 
-def tonemapped(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def tonemapped(image: NDArray[np.floating]) -> NDArray[np.floating]:
     """Linear RGB as sRGB in [0, 1], the brightest tenth of a percent clipped."""
     scaled = np.clip(image / max(float(np.percentile(image, 99.9)), 1e-20), 0, 1)
     return np.where(scaled <= 0.0031308, 12.92 * scaled, 1.055 * scaled ** (1 / 2.4) - 0.055)

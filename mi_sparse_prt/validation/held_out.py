@@ -7,108 +7,144 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
-VERTICES = 256  # per mesh
-TEXELS = 32  # per vertex
 SPP = 64
 STRATA = 4  # shadow rays per axis of a texel
 
 
-def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> dict[str, Any]:
-    """Estimate the relative L2 error of a matrix, per mesh and in total.
+class HeldOut:
+    """Random elements of T, evaluated twice, independently of each other and of any matrix.
 
-    Random elements are evaluated twice, independently of each other and of the matrix: with those values X and Y,
-    the mean of (T - X)(T - Y) estimates the squared error of T without the noise of X and Y, and that of X Y the
-    squared norm.
+    With the two values X and Y, the mean of (T - X)(T - Y) estimates the squared error of a matrix T without the
+    noise of X and Y, and that of X Y the squared norm.
 
     Parameters
     ----------
     scene : Scene
-    transport : LightTransport
-        With rows in the scene's vertex order.
+    lighting : CubemapLighting
+    basis : {"direction", "texel"}
     max_depth : int
         As for ``precompute``.
+    indirect : bool
+        Whether there is indirect light.
     seed : int
-        Of the matrix; the elements are drawn with others.
+        Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
+    vertices_per_mesh, texels_per_vertex : int
 
-    Returns
-    -------
-    dict
-        ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes`` again,
-        from the spread between vertices), ``elements`` (how many were evaluated).
+    Attributes
+    ----------
+    vertices : (k,) integers
+        Sorted; of all meshes.
+    texels : (k, t) integers
+        Texels held out at each vertex.
     """
-    rng = np.random.default_rng([seed, 1])
-    n_directions = transport.lighting.n_directions
-    squares, norms, spreads, count = {}, {}, {}, 0
-    for mesh in scene.meshes:
-        n = mesh.vertices.stop - mesh.vertices.start
-        vertices = np.sort(rng.choice(n, min(n, VERTICES), replace=False)) + mesh.vertices.start
-        texels = np.stack(
-            [rng.choice(n_directions, min(n_directions, TEXELS), replace=False) for _ in vertices]
+
+    def __init__(
+        self,
+        scene: Scene,
+        lighting: CubemapLighting,
+        basis: str,
+        max_depth: int,
+        indirect: bool,
+        seed: int,
+        vertices_per_mesh: int = 256,
+        texels_per_vertex: int = 32,
+    ) -> None:
+        rng = np.random.default_rng([seed, 1])
+        self._sizes = {m.name: m.vertices.stop - m.vertices.start for m in scene.meshes}
+        self._inside: dict[str, slice] = {}
+        chosen: list[NDArray[np.int64]] = []
+        for mesh in scene.meshes:
+            count = min(self._sizes[mesh.name], vertices_per_mesh)
+            start = sum(len(c) for c in chosen)
+            self._inside[mesh.name] = slice(start, start + count)
+            chosen.append(
+                mesh.vertices.start + np.sort(rng.choice(self._sizes[mesh.name], count, replace=False))
+            )
+        self.vertices = np.concatenate(chosen)
+        n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
+        self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
+        depth = max_depth if indirect else 2
+        self._x, self._y = (
+            _elements(scene, lighting, basis, depth, self.vertices, self.texels, (seed << 2) + k)
+            for k in (2, 3)
         )
-        error, norm = _products(
-            scene, transport, max_depth, seed, vertices, texels
-        )  # [vertex], means over texels
-        count += texels.size
-        squares[mesh.name], norms[mesh.name] = n * error.mean(), n * norm.mean()
-        spreads[mesh.name] = n * error.std(ddof=1) / np.sqrt(len(error)) if len(error) > 1 else 0.0
-    meshes = {name: _relative(squares[name], norms[name], spreads[name]) for name in squares}
-    spread = float(np.sqrt(sum(s**2 for s in spreads.values())))
-    total = _relative(sum(squares.values()), sum(norms.values()), spread)
-    return {
-        "total": total[0],
-        "meshes": {name: value for name, (value, _) in meshes.items()},
-        "standard_error": {"total": total[1], "meshes": {name: error for name, (_, error) in meshes.items()}},
-        "elements": count,
-    }
+
+    def error(self, elements: NDArray[np.floating]) -> dict[str, Any]:
+        """Relative L2 error of a matrix of which these are the held-out elements.
+
+        Parameters
+        ----------
+        elements : (k, t, 3) float
+            ``T[vertices[:, None], texels]``.
+
+        Returns
+        -------
+        dict
+            ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes``
+            again, from the spread between vertices), ``elements`` (how many were evaluated).
+        """
+        # [vertex], means over texels
+        square = ((elements - self._x) * (elements - self._y)).sum(axis=2).mean(axis=1)
+        squares, spreads = self._by_mesh(square)
+        norms, _ = self._by_mesh((self._x * self._y).sum(axis=2).mean(axis=1))
+        meshes = {name: _relative(squares[name], norms[name], spreads[name]) for name in squares}
+        spread = float(np.sqrt(sum(s**2 for s in spreads.values())))
+        total = _relative(sum(squares.values()), sum(norms.values()), spread)
+        return {
+            "total": total[0],
+            "meshes": {name: value for name, (value, _) in meshes.items()},
+            "standard_error": {
+                "total": total[1],
+                "meshes": {name: error for name, (_, error) in meshes.items()},
+            },
+            "elements": self.texels.size,
+        }
+
+    def relative_square(self, values: NDArray[np.floating]) -> float:
+        """Sum over the whole matrix of a quantity known at the held-out elements, (k, t), over its squared norm."""
+        sums, _ = self._by_mesh(values.mean(axis=1))
+        norms, _ = self._by_mesh((self._x * self._y).sum(axis=2).mean(axis=1))
+        return sum(sums.values()) / max(sum(norms.values()), 1e-300)
+
+    def squared_error(self, elements: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Unbiased squared errors (k, t) of single elements (k, t, 3), summed over channels."""
+        return ((elements - self._x) * (elements - self._y)).sum(axis=2)
+
+    def _by_mesh(self, values: NDArray[np.floating]) -> tuple[dict[str, float], dict[str, float]]:
+        """Sums over all vertices of a quantity known at the chosen ones, and their standard errors."""
+        sums, spreads = {}, {}
+        for name, inside in self._inside.items():
+            own, size = values[inside], self._sizes[name]
+            sums[name] = size * float(own.mean())
+            spreads[name] = size * float(own.std(ddof=1)) / np.sqrt(len(own)) if len(own) > 1 else 0.0
+        return sums, spreads
 
 
-def _products(
+def _elements(
     scene: Scene,
-    transport: LightTransport,
-    max_depth: int,
-    seed: int,
-    vertices: NDArray[np.int64],
-    texels: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean over each vertex's texels (and sum over channels) of (T - X)(T - Y) and of X Y."""
-    flat = np.repeat(vertices, texels.shape[1]), texels.ravel()
-    rows = transport.rows(vertices)  # [vertex, direction, rgb]
-    ours = np.take_along_axis(rows, texels[..., None], axis=1).reshape(-1, 3).astype(np.float64)
-    x, y = (
-        transport.albedo[flat[0]] * _white_elements(scene, transport, max_depth, *flat, seed=(seed << 2) + k)
-        for k in (2, 3)
-    )
-    shape = (*texels.shape, 3)
-    error = ((ours - x) * (ours - y)).reshape(shape).sum(axis=2).mean(axis=1)
-    norm = (x * y).reshape(shape).sum(axis=2).mean(axis=1)
-    return error, norm
-
-
-def _white_elements(
-    scene: Scene,
-    transport: LightTransport,
+    lighting: CubemapLighting,
+    basis: str,
     max_depth: int,
     vertices: NDArray[np.int64],
     texels: NDArray[np.int64],
     seed: int,
 ) -> NDArray[np.float64]:
-    """White elements (n, 3) at the full resolution of the lighting."""
-    lighting, points = transport.lighting, vertex_points(scene)
-    direct = DirectTransport(scene.normalised, lighting, points, transport.basis, STRATA, seed)
-    white = np.repeat(direct.elements(vertices, texels)[:, None].astype(np.float64), 3, axis=1)
-    if transport.indirect is not None:
-        channels = transport.indirect.density.shape[2]
+    """Elements of T, (k, t, 3), at the full resolution of the lighting."""
+    points, flat = vertex_points(scene), (np.repeat(vertices, texels.shape[1]), texels.ravel())
+    direct = DirectTransport(scene.normalised, lighting, points, basis, STRATA, seed)
+    white = np.repeat(direct.elements(*flat)[:, None].astype(np.float64), 3, axis=1)
+    if max_depth != 2:
         path = PathTransport(
-            scene.normalised, lighting, points, transport.basis, max_depth, SPP, channels, seed
+            scene.normalised, lighting, points, basis, max_depth, SPP, 1 if scene.grey else 3, seed
         )
-        white += path.elements(vertices, texels).mean * lighting.solid_angles[texels][:, None]
-    return white
+        white += path.elements(*flat).mean * lighting.solid_angles[texels.ravel()][:, None]
+    return scene.albedo[vertices][:, None] * white.reshape(*texels.shape, 3)
 
 
 def _relative(square: float, norm: float, spread: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Is the matrix right? Rows and columns against Mitsuba's own render of the matrix, and a relit image against ``path``."""
+"""Is the matrix right? Against Mitsuba's own render of it, and a relit image against ``path``."""
 
 from __future__ import annotations
 
@@ -148,11 +148,11 @@ def matrix_errors(
     dict
         See ``Validation.report``. The mean of (T - X)(T - Y) over elements is free of the noise of X and Y.
     """
-    ours, first, second = (a.astype(np.float64) for a in (ours, first, second))
-    square = ((ours - first) * (ours - second)).sum(axis=2)  # [row, column]
-    norm = (first * second).sum(axis=2)
-    noise = ((first - second) ** 2).sum(axis=2) / 4  # of the mean of the two
-    plain = ((ours - (first + second) / 2) ** 2).sum(axis=2)
+    t, x, y = (a.astype(np.float64) for a in (ours, first, second))
+    square = ((t - x) * (t - y)).sum(axis=2)  # [row, column]
+    norm = (x * y).sum(axis=2)
+    noise = ((x - y) ** 2).sum(axis=2) / 4  # of the mean of the two
+    plain = ((t - (x + y) / 2) ** 2).sum(axis=2)
     weight = np.zeros(len(vertices))  # of a row in the whole matrix
     inside = {}
     for mesh in meshes:
@@ -170,9 +170,9 @@ def matrix_errors(
         "relative_l2": {
             "total": total(square),
             "meshes": {
-                name: float(_ratio(square[rows_].sum(), norm[rows_].sum()))
-                for name, rows_ in inside.items()
-                if rows_.any()
+                name: float(_ratio(square[own].sum(), norm[own].sum()))
+                for name, own in inside.items()
+                if own.any()
             },
         },
         "reference_noise": total(noise),
@@ -253,7 +253,7 @@ def _image_error(
     background = background_emitter(lighting, transport)
     max_depth = transport.report["parameters"]["max_depth"]
     sensor = scene.mitsuba.sensors()[0]
-    with _resized(sensor, width):
+    with _Resized(sensor, width):
         ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
         halves = [
             reference_image(scene, background, sensor, max_depth, spp // 2, seed=2 * seed + 10 + k)
@@ -271,7 +271,7 @@ def _image_error(
     return report, draw.images(ours, reference, flip_map, report)
 
 
-class _resized:
+class _Resized:
     """Within this context a sensor's film has another width and the same shape."""
 
     def __init__(self, sensor: mi.Sensor, width: int) -> None:

@@ -1,0 +1,421 @@
+"""The commands and their options; each is a few lines around one function of the package."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.cli.files import image_bytes, npy_bytes, ply_bytes
+from mi_sparse_prt.cli.running import make_folder, prompt_interrupts, running
+from mi_sparse_prt.cli.tables import (
+    benchmark_tables,
+    bytes_text,
+    duration_text,
+    matrix_tables,
+    plain_table,
+    scene_report,
+    scene_tables,
+    validation_table,
+)
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.precompute import Stopwatch
+from mi_sparse_prt.variant import VARIANTS
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,
+    help="Precomputed light transport for Mitsuba 3 scenes: compute a matrix once, relight the scene in milliseconds.",
+    epilog="Start with: mi-sparse-prt precompute SCENE.xml -o SCENE.prt",
+)
+
+
+class Basis(StrEnum):
+    """How light arrives from a texel of the lighting."""
+
+    direction = "direction"
+    texel = "texel"
+
+
+def _switch_variant(name: str | None) -> str | None:
+    """Start again in another Mitsuba variant: it has to be chosen before the package is imported."""
+    if name is None or name == prt.variant():
+        return name
+    if name not in VARIANTS:
+        raise typer.BadParameter(f"{name!r}; choose one of: {', '.join(VARIANTS)}")
+    os.environ["MI_SPARSE_PRT_VARIANT"] = name
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def _definitions(pairs: list[str] | None) -> dict[str, str]:
+    """NAME=VALUE pairs as ``load_scene`` takes them."""
+    split = [pair.partition("=") for pair in pairs or []]
+    for pair, (name, equals, _) in zip(pairs or [], split, strict=True):
+        if not equals or not name.isidentifier() or name in ("path", "edge_length"):
+            raise typer.BadParameter(
+                f"{pair!r} is not NAME=VALUE with the NAME of a <default> in the scene", param_hint="-D"
+            )
+    return {name: value for name, _, value in split}
+
+
+def _check_suffix(path: Path | None, suffixes: tuple[str, ...], option: str) -> None:
+    if path is not None and path.suffix.lower() not in suffixes:
+        raise typer.BadParameter(
+            f"{path}: give a name that ends in {' or '.join(suffixes)}", param_hint=option
+        )
+
+
+SceneFile = Annotated[
+    Path, typer.Argument(metavar="SCENE", help="Mitsuba scene, an XML file.", show_default=False)
+]
+MatrixFile = Annotated[
+    Path, typer.Argument(metavar="MATRIX", help="Matrix file that `precompute` wrote.", show_default=False)
+]
+Define = Annotated[
+    list[str] | None,
+    typer.Option(
+        "-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; may be repeated."
+    ),
+]
+EdgeLength = Annotated[
+    float | None,
+    typer.Option(
+        help="Longest edge of a triangle, world units; inf leaves meshes as they are.",
+        show_default="diagonal of the scene / 64",
+    ),
+]
+JsonFile = Annotated[
+    str | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Also write the report as JSON; - is standard output, and then alone there.",
+    ),
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress and no tables; warnings and errors stay.")
+]
+Variant = Annotated[
+    str | None,
+    typer.Option(
+        envvar="MI_SPARSE_PRT_VARIANT",
+        callback=_switch_variant,
+        is_eager=True,
+        metavar="NAME",
+        help="Mitsuba variant, " + " or ".join(VARIANTS) + ".",
+        show_default="cuda_ad_rgb where there is a GPU, else llvm_ad_rgb",
+    ),
+]
+
+
+@app.command()
+def precompute(
+    scene: SceneFile,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Matrix file to write, by convention *.prt.",
+            show_default=False,
+        ),
+    ],
+    resolution: Annotated[
+        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
+    ] = 32,
+    basis: Annotated[
+        Basis, typer.Option(help="Light from a texel's centre alone, or from its whole area.")
+    ] = Basis.direction,
+    max_depth: Annotated[
+        int,
+        typer.Option(
+            help="As Mitsuba's path: 2 is direct light only, 5 three interreflections, -1 no limit."
+        ),
+    ] = 5,
+    spp: Annotated[int, typer.Option(help="Paths per element of the indirect light.")] = 16,
+    indirect_resolution: Annotated[
+        int | None,
+        typer.Option(
+            help="Texels along an edge of the indirect light's cubemap: its cost grows with the square. "
+            "The report says what a coarse one costs in error.",
+            show_default="8, or the resolution",
+        ),
+    ] = None,
+    strata: Annotated[
+        int, typer.Option(help="With --basis texel: shadow rays per element are the square of this.")
+    ] = 2,
+    edge_length: EdgeLength = None,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same matrix.")] = 0,
+    define: Define = None,
+    variant: Variant = None,
+    json_file: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compute the light transport matrix of a scene and write it to a file.
+
+    Example: mi-sparse-prt precompute scenes_xml/bunny.xml -o bunny.prt
+
+    A forecast of time and memory comes first; a table of what was done, skipped and how good it is comes last.
+    Direct light only, in seconds: add --max-depth 2.
+    """
+    with running(json_file, quiet, outputs=[output]) as command:
+        parameters = _definitions(define)
+        loaded = prt.load_scene(scene, edge_length, **parameters)
+        with prompt_interrupts():
+            transport = prt.precompute(
+                loaded,
+                prt.CubemapLighting(resolution),
+                basis=basis.value,
+                max_depth=max_depth,
+                spp=spp,
+                seed=seed,
+                progress=not quiet,
+                indirect_resolution=min(8, resolution)
+                if indirect_resolution is None
+                else indirect_resolution,
+                strata=strata,
+            )
+        # what `relight` needs to load the same scene again
+        transport.report["scene"] |= {
+            "path": str(scene.absolute()),
+            "parameters": parameters,
+            "edge_length": None if edge_length is None else str(edge_length),
+        }
+        transport.save(output)
+        command.written.append(output)
+        command.report = transport.report | {"file": {"path": str(output), "bytes": output.stat().st_size}}
+        command.show(*matrix_tables(transport, output))
+
+
+@app.command()
+def relight(
+    matrix: MatrixFile,
+    environment: Annotated[
+        Path,
+        typer.Option(
+            "--environment",
+            "-e",
+            metavar="ENV",
+            help="Equirectangular HDR image: .exr, .hdr or .pfm.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Image to write: .png (sRGB) or .exr (linear).",
+            show_default=False,
+        ),
+    ] = None,
+    vertices: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Radiance of the vertices: .npy (n_v, 3), or .ply with linear colours.",
+            show_default=False,
+        ),
+    ] = None,
+    rotate: Annotated[
+        float, typer.Option(metavar="DEGREES", help="Turn the environment about +y, the up axis.")
+    ] = 0.0,
+    exposure: Annotated[
+        float, typer.Option(metavar="STOPS", help="Brighten a .png by this power of two.")
+    ] = 0.0,
+    sensor: Annotated[int, typer.Option(help="Which of the scene's cameras.")] = 0,
+    spp: Annotated[
+        int, typer.Option(help="Samples per pixel, for edges and textures: the light has no noise.")
+    ] = 64,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENE", help="Mitsuba scene of the matrix.", show_default="the one it was computed for"
+        ),
+    ] = None,
+    define: Define = None,
+    variant: Variant = None,
+    json_file: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Light a scene with an environment through its matrix, and write the camera's image.
+
+    Example: mi-sparse-prt relight bunny.prt -e scenes_xml/envmaps/city.exr --rotate 90 -o bunny.png
+    """
+    if output is None and vertices is None:
+        raise typer.BadParameter("nothing to write: give -o IMAGE or --vertices FILE", param_hint="-o")
+    _check_suffix(output, (".png", ".exr"), "-o")
+    _check_suffix(vertices, (".npy", ".ply"), "--vertices")
+    with running(json_file, quiet, outputs=[output, vertices]) as command:
+        clock = Stopwatch()
+        with clock.phase("load"):
+            light = prt.load_environment(environment).rotated(rotate)
+            transport = prt.load_transport(matrix)
+            loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
+        with clock.phase("relight"):
+            radiance = transport.relight(light)  # [vertex, rgb]
+        files: dict[Path, bytes] = {}
+        report: dict[str, Any] = {
+            "matrix": str(matrix),
+            "environment": light.report,
+            "rotation_degrees": rotate,
+        }
+        if vertices is not None:
+            npy = vertices.suffix.lower() == ".npy"
+            files[vertices] = npy_bytes(radiance) if npy else ply_bytes(loaded, radiance)
+            mean = radiance.mean(axis=0).tolist()
+            report["vertices"] = {"path": str(vertices), "count": len(radiance), "mean": mean}
+        if output is not None:
+            with clock.phase("render"):
+                image = prt.render(loaded, transport, light, sensor, spp)  # [row, column, rgb]
+            files[output] = image_bytes(image, output.suffix.lower(), exposure)
+            height, width = image.shape[:2]
+            report["image"] = {
+                "path": str(output),
+                "width": width,
+                "height": height,
+                "mean": float(image.mean()),
+            }
+        for path, content in files.items():
+            command.write(path, content)
+        command.report = report | {"seconds": clock.report()}
+        table = plain_table(f"{matrix} under {environment}, turned by {rotate:g} degrees", "", "")
+        for phase in ("load", "relight", "render"):
+            if phase in clock.seconds:
+                table.add_row(phase, duration_text(clock.seconds[phase]))
+        for path, content in files.items():
+            table.add_row(str(path), bytes_text(len(content)))
+        command.show(table)
+
+
+@app.command()
+def validate(
+    scene: SceneFile,
+    matrix: MatrixFile,
+    rows: Annotated[int, typer.Option(help="Vertices to compare at, drawn from every mesh.")] = 64,
+    columns: Annotated[int, typer.Option(help="Texels to compare at: one render each.")] = 256,
+    spp: Annotated[int, typer.Option(help="Samples per element of Mitsuba's render.")] = 1024,
+    seed: Annotated[int, typer.Option(help="Of the choice of elements and of the render.")] = 0,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="Write pictures and report.json there.",
+            show_default=False,
+        ),
+    ] = None,
+    define: Define = None,
+    variant: Variant = None,
+    json_file: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a matrix with Mitsuba's own render of it, and a relit image with Mitsuba's path.
+
+    Example: mi-sparse-prt validate scenes_xml/bunny.xml bunny.prt -o bunny_validation
+
+    Errors are relative L2; the reference's own noise is measured, reported beside them and not counted.
+    """
+    with running(json_file, quiet) as command:
+        if output is not None:
+            make_folder(output)
+        transport = prt.load_transport(matrix)
+        loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
+        with prompt_interrupts():
+            result = prt.validate(
+                loaded, transport, n_rows=rows, n_columns=columns, spp=spp, seed=seed, progress=not quiet
+            )
+        command.report = result.report
+        if output is not None:
+            result.save(output)
+            command.written.append(output)
+        command.show(validation_table(result.report, f"{matrix} against Mitsuba"))
+
+
+@app.command()
+def info(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Matrix file, or scene (.xml).", show_default=False)
+    ],
+    edge_length: EdgeLength = None,
+    define: Define = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Say what a matrix holds, how it was made and how good it is, or what a scene would give.
+
+    Example: mi-sparse-prt info bunny.prt
+
+    A matrix file is read whole, so this also finds a damaged one.
+    """
+    with running(json_file, quiet=False) as command:
+        if file.suffix.lower() == ".xml":
+            scene = prt.load_scene(file, edge_length, **_definitions(define))
+            command.report = scene_report(scene)
+            command.show(*scene_tables(scene))
+        else:
+            transport = prt.load_transport(file)
+            command.report = transport.report | {"file": {"path": str(file), "bytes": file.stat().st_size}}
+            command.show(*matrix_tables(transport, file))
+
+
+@app.command()
+def benchmark(
+    scene: SceneFile,
+    resolution: Annotated[
+        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
+    ] = 32,
+    repeats: Annotated[
+        int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")
+    ] = 3,
+    edge_length: EdgeLength = None,
+    define: Define = None,
+    variant: Variant = None,
+    json_file: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure speed and memory on this machine: the direct matrix against bare rays, paths, relighting.
+
+    Example: mi-sparse-prt benchmark scenes_xml/bunny.xml --json benchmark.json
+
+    Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
+    """
+    from mi_sparse_prt.benchmark import run_benchmark
+
+    with running(json_file, quiet) as command:
+        loaded = prt.load_scene(scene, edge_length, **_definitions(define))
+        with prompt_interrupts():
+            command.report = run_benchmark(
+                loaded, prt.CubemapLighting(resolution), repeats, progress=not quiet
+            )
+        command.show(*benchmark_tables(command.report))
+
+
+def _scene_of(
+    transport: prt.LightTransport, matrix: Path, path: Path | None, parameters: dict[str, str]
+) -> tuple[prt.Scene, prt.LightTransport]:
+    """The scene of a matrix, loaded as ``precompute`` loaded it, and the matrix in this scene's vertex order."""
+    recorded = transport.report.get("scene", {})
+    if path is None:
+        if not recorded.get("path"):
+            raise PrtError(f"{matrix} does not say which scene it was computed for: give --scene SCENE.xml")
+        path = Path(recorded["path"])
+        if not path.is_file():
+            raise PrtError(
+                f"{matrix} was computed for {path}, which is not there any more: give --scene SCENE.xml"
+            )
+    edge_length = recorded.get("edge_length")
+    scene = prt.load_scene(
+        path,
+        None if edge_length is None else float(edge_length),
+        **recorded.get("parameters", {}) | parameters,
+    )
+    return scene, transport.for_scene(scene)

@@ -1,0 +1,186 @@
+"""What all commands share: one-line errors and warnings, exit codes, Ctrl-C, files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.errors import PrtError, PrtWarning
+
+FAILED, INTERRUPTED = 1, 130  # exit codes
+GRACE = 1.0  # seconds that Ctrl-C gives a kernel to end by itself
+
+
+class Command:
+    """What a running command has to say and has written."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.report: dict[str, Any] = {}
+        self.written: list[Path] = []
+        self._console = Console(quiet=quiet, markup=False, emoji=False, highlight=False)
+
+    def show(self, *tables: Table) -> None:
+        for table in tables:
+            self._console.print(table)
+
+    def write(self, path: Path, content: bytes) -> None:
+        """Write a file under a temporary name beside it, and rename it when it is complete.
+
+        Raises
+        ------
+        PrtError
+            If that fails (full disk, permissions); nothing is left behind.
+        """
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            temporary.write_bytes(content)
+            os.replace(temporary, path)
+        except OSError as error:
+            raise PrtError(
+                f"cannot write {path}: {_reason(error)}; free some space or choose another folder"
+            ) from None
+        finally:
+            temporary.unlink(missing_ok=True)
+        self.written.append(path)
+
+
+@contextmanager
+def running(json_file: str | None, quiet: bool, outputs: Iterable[Path | None] = ()) -> Iterator[Command]:
+    """Run a command's body: check its outputs first, turn trouble into one line and an exit code, write the JSON."""
+    command = Command(quiet)
+    to_stdout = json_file == "-"
+    try:
+        for path in [*outputs, None if to_stdout or json_file is None else Path(json_file)]:
+            if path is not None:
+                _check_writable(path)
+        with _one_line_warnings(), _stdout_is_stderr() if to_stdout else nullcontext():
+            yield command
+        if json_file is not None:
+            text = json.dumps(command.report, indent=1)
+            if to_stdout:
+                print(text)
+            else:
+                command.write(Path(json_file), text.encode())
+    except KeyboardInterrupt:
+        done = ", ".join(map(str, command.written))
+        _complain(f"interrupted; {done + ' was written' if done else 'nothing was written'}")
+        raise typer.Exit(INTERRUPTED) from None
+    except PrtError as error:
+        _complain(str(error))
+        raise typer.Exit(FAILED) from None
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # a reader such as `head` has enough
+            raise
+        _complain(f"{error.filename}: {_reason(error)}" if error.filename else _reason(error))
+        raise typer.Exit(FAILED) from None
+    except MemoryError as error:
+        _complain(f"out of memory ({error}); lower --resolution or --indirect-resolution")
+        raise typer.Exit(FAILED) from None
+
+
+@contextmanager
+def prompt_interrupts() -> Iterator[None]:
+    """End the process soon after Ctrl-C, inside a kernel too: Python alone would wait until that has ended.
+
+    For work that has no file open: a thread ends the process without asking the main one.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    usual = signal.set_wakeup_fd(writer)  # one byte per signal, its number, at once
+    finished = threading.Event()
+
+    def watch() -> None:
+        while not finished.is_set():
+            if os.read(reader, 1)[0] == signal.SIGINT and not finished.wait(GRACE):
+                _complain("interrupted; nothing was written")
+                os._exit(INTERRUPTED)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        signal.set_wakeup_fd(usual)
+        os.write(writer, b"\0")
+        watcher.join()
+        os.close(reader)
+        os.close(writer)
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Show the package's warnings as 'warning: ...' between progress bars."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", PrtWarning)
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            if issubclass(category, PrtWarning):
+                tqdm.write(f"warning: {message}", file=sys.stderr)
+            else:
+                usual(message, category, *rest, **more)
+
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def _stdout_is_stderr() -> Iterator[None]:
+    """Send what is printed, by Mitsuba's C++ side too, to standard error."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def _complain(message: str) -> None:
+    print(f"mi-sparse-prt: {' '.join(message.split())}", file=sys.stderr, flush=True)
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error) or type(error).__name__
+
+
+def _check_writable(path: Path) -> None:
+    """Find out before an hour of work whether its result can be written."""
+    if path.is_dir():
+        raise PrtError(f"cannot write {path}: it is a folder; give a file name")
+    if path.exists() and not path.is_file():  # /dev/null: the new file would take its place
+        raise PrtError(f"cannot write {path}: it is a device or a pipe; give a file name")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise PrtError(
+            f"cannot write {path}: {path.parent}: {_reason(error)}; choose another folder"
+        ) from None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and see that files can be written there (`PrtError` if not)."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PrtError(f"cannot make the folder {path}: {_reason(error)}; choose another one") from None
+    _check_writable(path / "report.json")

@@ -1,0 +1,207 @@
+"""Reports as tables for people; the JSON has more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.scene import Scene
+
+
+def plain_table(title: str, *columns: str) -> Table:
+    """A table whose first column is text, the others numbers."""
+    table = Table(title=title, title_justify="left", show_header=any(columns))
+    for k, column in enumerate(columns):
+        table.add_column(column, justify="left" if k == 0 else "right", overflow="fold")
+    return table
+
+
+def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
+    """What was done, how long it took, how good it is, and what was skipped."""
+    report = transport.report
+    vertices, directions, _ = transport.shape
+    done = plain_table(
+        f"{path}: {vertices} vertices x {directions} directions, {transport.basis} basis", "", ""
+    )
+    for name, key in (("elements", "elements_total"), ("elements evaluated", "elements_evaluated")):
+        done.add_row(name, f"{report[key]:,}")
+    for name, count in report["rays"].items():
+        done.add_row(
+            {"direct": "shadow rays", "indirect_paths": "indirect paths"}.get(name, name), f"{count:,}"
+        )
+    done.add_row("matrix in memory", bytes_text(transport.nbytes))
+    done.add_row("file", bytes_text(path.stat().st_size))
+    done.add_row("peak memory", bytes_text(report["peak_memory_bytes"]))
+    for name in ("max_depth", "spp", "indirect_resolution", "strata", "seed"):
+        done.add_row(name, str(report["parameters"][name]))
+    for name in ("path", "hash"):
+        done.add_row(f"scene {name}", str(report["scene"][name]))
+    done.add_row("versions", ", ".join(f"{name} {number}" for name, number in report["versions"].items()))
+
+    phases = plain_table("Time", "phase", "time", "share")
+    total = report["seconds"]["total"]
+    for name, seconds in report["seconds"].items():
+        if name not in ("total", "compile"):
+            phases.add_row(name, duration_text(seconds), f"{seconds / total:.0%}")
+    phases.add_section()
+    phases.add_row("total", duration_text(total), "")
+    phases.add_row("compile, apart", duration_text(report["seconds"]["compile"]), "")
+    phases.add_row("forecast", duration_text(report["forecast"]["seconds"]), "")
+
+    error = report["estimated_error"]
+    quality = plain_table(
+        "Estimated error (relative L2, from held-out elements)", "mesh", "vertices", "error", "+-"
+    )
+    for mesh in transport.meshes:
+        estimate, deviation = error["meshes"][mesh.name], error["standard_error"]["meshes"][mesh.name]
+        count = mesh.vertices.stop - mesh.vertices.start
+        quality.add_row(mesh.name, f"{count:,}", _share(estimate), _share(deviation))
+    quality.add_section()
+    quality.add_row(
+        "total", f"{vertices:,}", _share(error["total"]), _share(error["standard_error"]["total"])
+    )
+    tables = [done, phases, quality]
+    for title, sentences in (("Skipped", report["skipped"]), ("Warnings", report["scene"]["warnings"])):
+        if sentences:
+            tables.append(_sentences(title, sentences))
+    return tables
+
+
+def _sentences(title: str, sentences: list[str]) -> Table:
+    table = plain_table(title, "")
+    for sentence in sentences:
+        table.add_row(sentence)
+    return table
+
+
+def scene_tables(scene: Scene) -> list[Table]:
+    """What a scene consists of, and what its matrix would take."""
+    report = scene_report(scene)
+    meshes = plain_table(
+        f"{scene.path}: {report['vertices']:,} vertices", "mesh", "vertices", "triangles", "mean albedo"
+    )
+    for mesh in scene.meshes:
+        sizes = report["meshes"][mesh.name]
+        albedo = " ".join(f"{value:.3f}" for value in scene.albedo[mesh.vertices].mean(axis=0))
+        meshes.add_row(mesh.name, f"{sizes['vertices']:,}", f"{sizes['triangles']:,}", albedo)
+    facts = plain_table("Scene", "", "")
+    low, high = report["box"]
+    facts.add_row(
+        "box", " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (low, high))
+    )
+    facts.add_row("grey, so one channel of indirect light", "yes" if scene.grey else "no")
+    facts.add_row("diffuse only", "yes" if scene.diffuse else "no")
+    facts.add_row("direct matrix, 6 x 32 x 32 directions", bytes_text(report["vertices"] * 6144 // 8))
+    facts.add_row("hash", scene.hash)
+    return [meshes, facts, *([_sentences("Warnings", scene.warnings)] if scene.warnings else [])]
+
+
+def validation_table(report: dict[str, Any], title: str) -> Table:
+    """Errors of rows, columns and image, and the reference's own noise (see ``Validation``)."""
+    table = plain_table(title, "relative L2 unless said otherwise", "")
+    for mesh, error in report["relative_l2"]["meshes"].items():
+        table.add_row(f"mesh {mesh}", _share(error))
+    table.add_row("total", _share(report["relative_l2"]["total"]))
+    table.add_row("Mitsuba's own noise, not counted above", _share(report["reference_noise"]))
+    table.add_section()
+    table.add_row("95th percentile of rows", _share(report["row_95th_percentile"]))
+    row, column = report["row_worst"], report["column_worst"]
+    table.add_row(f"worst row, vertex {row['vertex']}", _share(row["relative_l2"]))
+    table.add_row(f"worst column, texel {column['texel']}", _share(column["relative_l2"]))
+    table.add_row("direct elements that differ by over 1e-4, share", _share(report["direct_at_hits"]))
+    table.add_row("Mitsuba's hit against the vertex itself", _share(report["hit_against_vertex"]))
+    if "image" in report:
+        table.add_section()
+        image = report["image"]
+        table.add_row("relit image", _share(image["relative_l2"]))
+        table.add_row("its reference's noise, not counted above", _share(image["reference_noise"]))
+        table.add_row("FLIP, mean", f"{image['flip']:.4f}")
+    return table
+
+
+def benchmark_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``run_benchmark`` measured, and on which machine."""
+    machine, direct, paths, relit = (report[part] for part in ("machine", "direct", "paths", "relight"))
+    rays = plain_table(
+        f"Direct matrix, {report['scene']['vertices']:,} vertices x {report['scene']['directions']} directions",
+        "",
+        "",
+    )
+    rays.add_row("matrix, bits on the host", duration_text(direct["seconds"]))
+    rays.add_row("the same rays and a count", duration_text(direct["bare_seconds"]))
+    rays.add_row("ratio", f"{direct['ratio']:.3f}")
+    rays.add_row("rays above the horizon", f"{direct['rays_per_second'] / 1e6:.1f} M/s")
+    rays.add_row("peak memory", bytes_text(direct["peak_memory_bytes"]))
+    rays.add_row(*_kernel_row(direct["kernels"], direct["blocks"]))
+    rays.add_row("first run, compilation included", duration_text(direct["first_run_seconds"]))
+
+    walks = plain_table(
+        f"Indirect light, max_depth {paths['max_depth']}, {paths['spp']} paths per element", "", ""
+    )
+    for name, label in (("rows", "whole rows"), ("scattered", "scattered elements")):
+        walks.add_row(label, f"{paths[name]['paths_per_second'] / 1e6:.2f} M paths/s")
+        walks.add_row(*_kernel_row(paths[name]["kernels"], paths["blocks"]))
+        walks.add_row("first run, compilation included", duration_text(paths[name]["first_run_seconds"]))
+    walks.add_row("whole matrix by this", duration_text(paths["whole_matrix_seconds"]))
+
+    frames = plain_table("Relighting all vertices", "", "")
+    frames.add_row("direct light", duration_text(relit["direct"]["seconds"]))
+    label = f"with indirect light, 6 x {relit['indirect_resolution']}^2, {relit['channels']} channel(s)"
+    frames.add_row(label, duration_text(relit["with_indirect"]["seconds"]))
+
+    host = plain_table("Machine", "", "")
+    host.add_row(
+        "processor", f"{machine['cpu']}, {machine['cores']} cores, {machine['drjit_threads']} Dr.Jit threads"
+    )
+    host.add_row("load average (over the cores: disturbed)", f"{machine['load_average']:.1f}")
+    host.add_row("versions", ", ".join(f"{name} {number}" for name, number in machine["versions"].items()))
+    return [rays, walks, frames, host]
+
+
+def _kernel_row(kernels: dict[str, Any], blocks: int) -> tuple[str, str]:
+    found = ", ".join(
+        f"{kernels[k]} {label}" for k, label in (("compiled", "compiled"), ("on_disk", "from disk"))
+    )
+    return f"kernels in {blocks} blocks", f"{kernels['distinct']} ({found})"
+
+
+def _share(value: float) -> str:
+    return f"{value:.2%}" if value >= 1e-3 or value == 0 else f"{value:.1e}"
+
+
+def duration_text(seconds: float) -> str:
+    """Seconds, in a unit that people read."""
+    if seconds < 0.1:
+        return f"{seconds * 1e3:.1f} ms"
+    return f"{seconds:.2f} s" if seconds < 600 else f"{seconds / 60:.0f} min"
+
+
+def bytes_text(count: float) -> str:
+    """A number of bytes, in a unit that people read."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count:.0f} B"
+
+
+def scene_report(scene: Scene) -> dict[str, Any]:
+    """A scene's facts, JSON as it is."""
+    return {
+        "path": scene.path,
+        "hash": scene.hash,
+        "vertices": len(scene.positions),
+        "meshes": {
+            mesh.name: {
+                "vertices": mesh.vertices.stop - mesh.vertices.start,
+                "triangles": len(mesh.triangles),
+            }
+            for mesh in scene.meshes
+        },
+        "box": [scene.positions.min(axis=0).tolist(), scene.positions.max(axis=0).tolist()],
+        "grey": scene.grey,
+        "diffuse": scene.diffuse,
+        "warnings": scene.warnings,
+    }

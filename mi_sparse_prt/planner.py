@@ -1,0 +1,151 @@
+"""What a target error costs: how fine and how well sampled the indirect light has to be, measured on a few vertices."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.validation.held_out import HeldOut
+
+PILOT_VERTICES = 64  # per mesh
+PILOT_SPP = 16
+COARSEST = 4
+SAFETY = 1.2  # more samples than predicted: the prediction itself is noisy
+MOST_SAMPLES = 4096
+
+
+@dataclass(frozen=True)
+class IndirectPlan:
+    """One way to compute the indirect light of a matrix.
+
+    Attributes
+    ----------
+    resolution, spp : int
+    bias : float
+        Relative L2 error of the whole matrix that no number of samples removes: interpolation between coarse texels,
+        and in the texel basis the direct part's own error.
+    noise : float
+        Relative L2 error of the whole matrix at one sample per element; falls with 1 / sqrt(spp).
+    """
+
+    resolution: int
+    spp: int
+    bias: float
+    noise: float
+
+    @property
+    def paths(self) -> int:
+        """Paths per vertex, the cost."""
+        return 6 * self.resolution**2 * self.spp
+
+    @property
+    def error(self) -> float:
+        """Predicted relative L2 error of the whole matrix."""
+        return math.sqrt(self.bias**2 + self.noise**2 / self.spp)
+
+    def report(self) -> dict[str, Any]:
+        return {**asdict(self), "paths_per_vertex": self.paths, "predicted_error": self.error}
+
+
+def plan_indirect(
+    scene: Scene,
+    lighting: CubemapLighting,
+    basis: str,
+    max_depth: int,
+    strata: int,
+    seed: int,
+    target_error: float,
+) -> list[IndirectPlan]:
+    """Find the cheapest resolution and sample count of the indirect light that meet a target error.
+
+    Parameters
+    ----------
+    scene, lighting, basis, max_depth, strata, seed
+        As for ``precompute``.
+    target_error : float
+        Relative L2 of the whole matrix.
+
+    Returns
+    -------
+    list of IndirectPlan
+        One per resolution, plans that meet the target first, the cheapest of them at the head.
+
+    Notes
+    -----
+    On a few vertices of each mesh, rows are computed at every resolution and compared with held-out elements. Their
+    squared error is that of the samples, which is known from their variance, plus a rest that samples do not remove.
+    """
+    held = HeldOut(
+        scene, lighting, basis, max_depth, True, seed + (1 << 20), vertices_per_mesh=PILOT_VERTICES
+    )
+    plans = []
+    resolution = min(COARSEST, lighting.resolution)
+    while resolution <= lighting.resolution:
+        bias, noise = _bias_and_noise(
+            scene, lighting, CubemapLighting(resolution), basis, max_depth, strata, seed, held
+        )
+        room = target_error**2 - bias**2
+        spp = math.ceil(SAFETY * noise**2 / room) if room > 0 else MOST_SAMPLES
+        plans.append(IndirectPlan(resolution, min(max(spp, 1), MOST_SAMPLES), bias, noise))
+        resolution *= 2
+    return sorted(
+        plans, key=lambda p: (p.error > target_error, p.paths if p.error <= target_error else p.error)
+    )
+
+
+def _bias_and_noise(
+    scene: Scene,
+    lighting: CubemapLighting,
+    coarse: CubemapLighting,
+    basis: str,
+    max_depth: int,
+    strata: int,
+    seed: int,
+    held: HeldOut,
+) -> tuple[float, float]:
+    """Relative L2 of what samples do not remove, and of the noise of one sample per element."""
+    points, shape = vertex_points(scene), held.texels.shape
+    flat = np.repeat(held.vertices, shape[1]), held.texels.ravel()
+    same = coarse.resolution == lighting.resolution
+    solver = PathTransport(
+        scene.normalised,
+        coarse,
+        points,
+        basis if same else "texel",
+        max_depth,
+        PILOT_SPP,
+        1 if scene.grey else 3,
+        seed,
+    )
+    if same:
+        estimate = solver.elements(*flat)
+        mean, variance = estimate.mean.reshape(*shape, -1), estimate.variance.reshape(*shape, -1)
+    else:
+        estimate = solver.rows(held.vertices)
+        mean, variance = np.empty((*shape, solver.channels)), np.empty((*shape, solver.channels))
+        weights = upsampling(coarse, lighting)
+        for k, texels in enumerate(held.texels):
+            own = weights[texels]
+            mean[k], variance[k] = own @ estimate.mean[k], own.multiply(own) @ estimate.variance[k]
+    direct = (
+        DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
+        .elements(*flat)
+        .reshape(shape)
+    )
+    albedo = scene.albedo[held.vertices][:, None]  # [vertex, 1, rgb]
+    solid_angles = lighting.solid_angles[held.texels][..., None]
+    square = held.squared_error(albedo * (direct[..., None] + mean * solid_angles))
+    noise = (albedo**2 * variance * solid_angles**2).sum(axis=2)
+    if same and basis == "direction":
+        return 0.0, math.sqrt(held.relative_square(noise) * PILOT_SPP)
+    bias = math.sqrt(max(held.relative_square(square - noise), 0.0))
+    return bias, math.sqrt(held.relative_square(noise) * PILOT_SPP)
