@@ -148,6 +148,15 @@ def precompute(
             show_default="8, or the resolution",
         ),
     ] = None,
+    target_error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="ERROR",
+            help="Relative L2 error of the matrix to aim at, 0.02 for 2%: a pilot then chooses --spp and "
+            "--indirect-resolution.",
+            show_default=False,
+        ),
+    ] = None,
     strata: Annotated[
         int, typer.Option(help="With --basis texel: shadow rays per element are the square of this.")
     ] = 2,
@@ -168,6 +177,7 @@ def precompute(
     with running(json_file, quiet, outputs=[output]) as command:
         parameters = _definitions(define)
         loaded = prt.load_scene(scene, edge_length, **parameters)
+        coarse = min(8, resolution) if indirect_resolution is None else indirect_resolution
         with prompt_interrupts():
             transport = prt.precompute(
                 loaded,
@@ -175,11 +185,10 @@ def precompute(
                 basis=basis.value,
                 max_depth=max_depth,
                 spp=spp,
+                target_error=target_error,
                 seed=seed,
                 progress=not quiet,
-                indirect_resolution=min(8, resolution)
-                if indirect_resolution is None
-                else indirect_resolution,
+                indirect_resolution=coarse,
                 strata=strata,
             )
         # what `relight` needs to load the same scene again

@@ -63,6 +63,8 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
     quality.add_row(
         "total", f"{vertices:,}", _share(error["total"]), _share(error["standard_error"]["total"])
     )
+    if report.get("target_error") is not None:
+        quality.add_row("target", "", _share(report["target_error"]), "")
     tables = [done, phases, quality]
     for title, sentences in (("Skipped", report["skipped"]), ("Warnings", report["scene"]["warnings"])):
         if sentences:

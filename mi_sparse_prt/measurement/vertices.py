@@ -211,4 +211,5 @@ def sensor_points(scene: Scene, rays: VertexRays | None = None) -> Points:
     si = scene.normalised.ray_intersect(ray)
     dr.eval(si)
     as_rows = [np.ascontiguousarray(a.numpy().T) for a in (si.p, si.sh_frame.n, si.n)]
-    return Points(as_rows[0], as_rows[1], as_rows[2], scene.vertex_keys)
+    # the random numbers of the vertices: what differs between the two is then due to the points alone
+    return Points(as_rows[0], as_rows[1], as_rows[2], vertex_points(scene).keys)

@@ -1,0 +1,81 @@
+"""Ctrl-C on the real program, in the middle of its work."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+# Light that bounces in a nearly white box until the paths are long: a wavefront takes seconds.
+SCENE = """<scene version="3.0.0">
+    <emitter type="constant"/>
+    <shape type="cube" id="room">
+        <boolean name="flip_normals" value="true"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.999, 0.998, 0.997"/></bsdf>
+    </shape>
+    <shape type="cube" id="box">
+        <transform name="to_world"><scale value="0.2"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.999"/></bsdf>
+    </shape>
+</scene>
+"""
+WORK = [
+    "--resolution",
+    "16",
+    "--indirect-resolution",
+    "16",
+    "--max-depth",
+    "400",
+    "--spp",
+    "64",
+    "--edge-length",
+    "0.05",
+]
+
+
+@pytest.mark.parametrize("phase", ["about to start", "in a kernel"])
+def test_ctrl_c_leaves_nothing(tmp_path, phase):
+    """
+    Rationale: a user who stops a long run wants the prompt back at once, and no file that looks like a result. Python
+        alone would wait for the kernel to end.
+    Expected: exit code 130 within 2 s, one line that says so, and only the scene in the folder; before the first
+        kernel and inside one.
+    Result: 1.0 to 1.1 s in a kernel, which is the second that it is given to end by itself.
+    """
+    (tmp_path / "scene.xml").write_text(SCENE)
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "mi_sparse_prt",
+            "precompute",
+            "scene.xml",
+            "-o",
+            "x.prt",
+            "--json",
+            "x.json",
+            *WORK,
+        ],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        # The scene has a warning, which comes when it is loaded: from there on, the forecast traces.
+        first = process.stderr.readline()
+        assert first.startswith("warning: "), first
+        time.sleep(0.0 if phase == "about to start" else 3.0)
+        assert process.poll() is None, "it was done too soon to be interrupted"
+        start = time.perf_counter()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+        waited = time.perf_counter() - start
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert errors.splitlines()[-1] == "mi-sparse-prt: interrupted; nothing was written"
+    assert "Traceback" not in errors
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.xml"]
+    assert waited < 2.0
