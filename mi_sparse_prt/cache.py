@@ -13,8 +13,9 @@ from typing import Any
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.precompute import checked_settings, precompute
+from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.storage import VERSION, load_transport
 
 
@@ -43,10 +44,7 @@ def cached_precompute(
         As for ``precompute``. Together with the scene's hash they are the key of the file; the order of the scene's
         shapes is not part of it.
     """
-    key = json.dumps(
-        [VERSION, scene.hash, lighting.resolution, asdict(checked_settings(lighting, **settings))],
-        sort_keys=True,
-    )
+    key = json.dumps([VERSION, scene.hash, asdict(Settings(lighting.resolution, **settings))], sort_keys=True)
     folder = folder or default_folder()
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.prt"
     if path.exists():
@@ -54,7 +52,7 @@ def cached_precompute(
             return load_transport(path, scene)
         except PrtError as error:
             warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
-    transport = precompute(scene, lighting, progress=progress, **settings)
+    transport = precompute(scene, lighting, progress=progress, checkpoint_folder=folder, **settings)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         transport.save(path)

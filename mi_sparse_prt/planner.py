@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.held_out import HeldOut
@@ -56,23 +58,15 @@ class IndirectPlan:
         return {**asdict(self), "paths_per_vertex": self.paths, "predicted_error": self.error}
 
 
-def plan_indirect(
-    scene: Scene,
-    lighting: CubemapLighting,
-    basis: str,
-    max_depth: int,
-    strata: int,
-    seed: int,
-    target_error: float,
-) -> list[IndirectPlan]:
+def plan_indirect(scene: Scene, lighting: CubemapLighting, settings: Settings) -> list[IndirectPlan]:
     """Find the cheapest resolution and sample count of the indirect light that meet a target error.
 
     Parameters
     ----------
-    scene, lighting, basis, max_depth, strata, seed
-        As for ``precompute``.
-    target_error : float
-        Relative L2 of the whole matrix.
+    scene : Scene
+    lighting : CubemapLighting
+    settings : Settings
+        With a ``target_error``, the relative L2 of the whole matrix.
 
     Returns
     -------
@@ -84,68 +78,69 @@ def plan_indirect(
     On a few vertices of each mesh, rows are computed at every resolution and compared with held-out elements. Their
     squared error is that of the samples, which is known from their variance, plus a rest that samples do not remove.
     """
+    assert settings.target_error is not None
+    target = settings.target_error
     held = HeldOut(
-        scene, lighting, basis, max_depth, True, seed + (1 << 20), vertices_per_mesh=PILOT_VERTICES
+        scene, lighting, settings.basis, settings.max_depth, True, settings.seed + (1 << 20), PILOT_VERTICES
     )
     plans = []
     resolution = min(COARSEST, lighting.resolution)
     while resolution <= lighting.resolution:
-        bias, noise = _bias_and_noise(
-            scene, lighting, CubemapLighting(resolution), basis, max_depth, strata, seed, held
-        )
-        room = target_error**2 - bias**2
+        tried = replace(settings, indirect_resolution=resolution)
+        bias, noise = _bias_and_noise(scene, lighting, tried, held)
+        room = target**2 - bias**2
         spp = math.ceil(SAFETY * noise**2 / room) if room > 0 else MOST_SAMPLES
         plans.append(IndirectPlan(resolution, min(max(spp, 1), MOST_SAMPLES), bias, noise))
         resolution *= 2
-    return sorted(
-        plans, key=lambda p: (p.error > target_error, p.paths if p.error <= target_error else p.error)
-    )
+    return sorted(plans, key=lambda p: (p.error > target, p.paths if p.error <= target else p.error))
 
 
 def _bias_and_noise(
-    scene: Scene,
-    lighting: CubemapLighting,
-    coarse: CubemapLighting,
-    basis: str,
-    max_depth: int,
-    strata: int,
-    seed: int,
-    held: HeldOut,
+    scene: Scene, lighting: CubemapLighting, settings: Settings, held: HeldOut
 ) -> tuple[float, float]:
     """Relative L2 of what samples do not remove, and of the noise of one sample per element."""
-    points, shape = vertex_points(scene), held.texels.shape
+    points, shape, basis = vertex_points(scene), held.texels.shape, settings.basis
     flat = np.repeat(held.vertices, shape[1]), held.texels.ravel()
-    same = coarse.resolution == lighting.resolution
     solver = PathTransport(
         scene.normalised,
-        coarse,
+        settings.coarse,
         points,
-        basis if same else "texel",
-        max_depth,
+        settings.indirect_basis,
+        settings.max_depth,
         PILOT_SPP,
         1 if scene.grey else 3,
-        seed,
+        settings.seed,
     )
-    if same:
-        estimate = solver.elements(*flat)
-        mean, variance = estimate.mean.reshape(*shape, -1), estimate.variance.reshape(*shape, -1)
-    else:
-        estimate = solver.rows(held.vertices)
-        mean, variance = np.empty((*shape, solver.channels)), np.empty((*shape, solver.channels))
-        weights = upsampling(coarse, lighting)
-        for k, texels in enumerate(held.texels):
-            own = weights[texels]
-            mean[k], variance[k] = own @ estimate.mean[k], own.multiply(own) @ estimate.variance[k]
-    direct = (
-        DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
-        .elements(*flat)
-        .reshape(shape)
-    )
+    same = settings.coarse.resolution == lighting.resolution
+    mean, variance = _at_elements(solver, held) if same else _interpolated(solver, lighting, held)
+    direct = DirectTransport(scene.normalised, lighting, points, basis, settings.strata, settings.seed)
     albedo = scene.albedo[held.vertices][:, None]  # [vertex, 1, rgb]
     solid_angles = lighting.solid_angles[held.texels][..., None]
-    square = held.squared_error(albedo * (direct[..., None] + mean * solid_angles))
+    white = direct.elements(*flat).reshape(*shape, 1) + mean * solid_angles
     noise = (albedo**2 * variance * solid_angles**2).sum(axis=2)
+    at_one_sample = math.sqrt(held.relative_square(noise) * PILOT_SPP)
     if same and basis == "direction":
-        return 0.0, math.sqrt(held.relative_square(noise) * PILOT_SPP)
-    bias = math.sqrt(max(held.relative_square(square - noise), 0.0))
-    return bias, math.sqrt(held.relative_square(noise) * PILOT_SPP)
+        return 0.0, at_one_sample
+    return math.sqrt(
+        max(held.relative_square(held.squared_error(albedo * white) - noise), 0.0)
+    ), at_one_sample
+
+
+def _at_elements(solver: PathTransport, held: HeldOut) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and variance (k, t, channels) of the held-out elements themselves."""
+    estimate = solver.elements(np.repeat(held.vertices, held.texels.shape[1]), held.texels.ravel())
+    shape = (*held.texels.shape, solver.channels)
+    return estimate.mean.reshape(shape), estimate.variance.reshape(shape)
+
+
+def _interpolated(
+    solver: PathTransport, lighting: CubemapLighting, held: HeldOut
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and variance (k, t, channels) at the held-out elements, interpolated from coarse rows."""
+    estimate, weights = solver.rows(held.vertices), upsampling(solver.lighting, lighting)
+    shape = (*held.texels.shape, solver.channels)
+    mean, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for k, texels in enumerate(held.texels):
+        own = weights[texels]
+        mean[k], variance[k] = own @ estimate.mean[k], own.multiply(own) @ estimate.variance[k]
+    return mean, variance

@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-import platform
+import hashlib
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import psutil
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.checkpoint import Checkpoint
+from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
-from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.planner import IndirectPlan, plan_indirect
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.held_out import HeldOut
 
-METHODS = ("brute_force",)
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 _PILOT_SHARE = 8  # a forecast traces this fraction of one wavefront
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Checked arguments of ``precompute``; what the matrix depends on besides the scene and the lighting."""
-
-    method: str
-    basis: str
-    max_depth: int
-    spp: int
-    strata: int
-    indirect_resolution: int
-    seed: int
 
 
 def precompute(
@@ -60,6 +46,7 @@ def precompute(
     *,
     indirect_resolution: int | None = None,
     strata: int = 2,
+    checkpoint_folder: str | Path | None = None,
 ) -> LightTransport:
     """Compute the light transport matrix of a scene.
 
@@ -90,6 +77,9 @@ def precompute(
         report includes what that costs.
     strata : int
         Texel basis: shadow rays per element are strata^2.
+    checkpoint_folder : path, optional
+        Finished rows of the indirect light are kept there until the matrix is complete: the same call after an
+        interruption goes on where it stopped.
 
     Returns
     -------
@@ -102,152 +92,63 @@ def precompute(
     PrtError
         If an argument makes no sense, or the matrix would not fit into memory.
     """
-    settings = checked_settings(
-        lighting,
-        method=method,
-        basis=basis,
-        max_depth=max_depth,
-        spp=spp,
-        target_error=target_error,
-        seed=seed,
-        indirect_resolution=indirect_resolution,
-        strata=strata,
+    settings = Settings(
+        lighting.resolution, method, basis, max_depth, spp, target_error, seed, indirect_resolution, strata
     )
-    _reset_peak_memory()
-    clock = Stopwatch()
-    points = vertex_points(scene)
-    plans: list[IndirectPlan] = []
-    if target_error is not None and _may_be_indirect(scene, settings) is None:
-        with clock.phase("plan"):
-            plans = plan_indirect(
-                scene, lighting, basis, max_depth, settings.strata, settings.seed, target_error
-            )
-        settings = replace(settings, spp=plans[0].spp, indirect_resolution=plans[0].resolution)
-    direct = DirectTransport(scene.normalised, lighting, points, basis, settings.strata, settings.seed)
-    indirect, skipped = _indirect_solver(scene, lighting, settings)
-    if indirect:
-        with clock.phase("pilot"):
-            surfaces_meet = indirect.any_hit(_PILOT_RAYS)
-        if not surfaces_meet:
-            indirect, skipped = None, ["indirect light: no surface sees another one"]
+    reset_peak_memory()
+    clock, points = Stopwatch(), vertex_points(scene)
+    settings, plans = _planned(scene, lighting, settings, clock)
+    direct = DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
+    indirect, skipped = _indirect_solver(scene, settings, points, clock)
     forecast = _forecast(direct, indirect, clock, progress)
-
-    with clock.phase("direct"):
-        stored = _trace(
-            direct, direct.row_storage(len(points)), lambda ids: direct.rows(ids), "direct", progress
-        )
+    checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
     transport = LightTransport(
         lighting=lighting,
         basis=basis,
         albedo=scene.albedo,
-        direct=Visibility(stored, scene.normals, lighting)
-        if basis == "direction"
-        else MeanCosine(stored, lighting),
-        indirect=_indirect_part(indirect, lighting, clock, progress) if indirect else None,
+        direct=_direct_part(direct, scene, clock, progress),
+        indirect=_indirect_part(indirect, lighting, clock, progress, checkpoint) if indirect else None,
         meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
         vertex_keys=points.keys,
         scene_hash=scene.hash,
     )
     with clock.phase("held_out"):
-        held = HeldOut(scene, lighting, basis, max_depth, indirect is not None, settings.seed)
-        elements = np.take_along_axis(transport.rows(held.vertices), held.texels[..., None], axis=1)
-        error = held.error(elements)
-    if target_error is not None and error["total"] - 2 * error["standard_error"]["total"] > target_error:
-        warnings.warn(
-            f"the target error {target_error:g} was not met: the estimate is {error['total']:.3g}",
-            PrtWarning,
-            stacklevel=2,
-        )
-
-    above = _share_above_horizon(scene.normals, lighting)
-    skipped.append(f"direct rays below the horizon: {1 - above:.0%} of the elements")
-    rays = {"direct": int(above * len(points) * lighting.n_directions) * direct.rays_per_element}
-    if indirect:
-        rays["indirect_paths"] = len(points) * indirect.lighting.n_directions * indirect.spp
+        error = _held_out_error(scene, transport, settings)
     transport.report.update(
         {
-            "seconds": clock.report(),
-            "elements_total": len(points) * lighting.n_directions,
-            "elements_evaluated": len(points) * lighting.n_directions,
-            "rays": rays,
+            **_evaluated(direct, indirect, skipped),
             "estimated_error": error,
-            "target_error": target_error,
-            "plans": [plan.report() for plan in plans],
-            "skipped": skipped,
+            "seconds": clock.report(),
             "stored_bytes": transport.nbytes,
-            "peak_memory_bytes": _peak_memory(),
+            "peak_memory_bytes": peak_memory(),
             "forecast": forecast,
-            "seed": settings.seed,
-            "parameters": {"resolution": lighting.resolution, **asdict(settings)},
+            "plans": [plan.report() for plan in plans],
+            "seed": seed,
+            "parameters": asdict(replace(settings, indirect_resolution=settings.coarse.resolution)),
             "scene": {
                 "path": scene.path,
                 "hash": scene.hash,
                 "vertices": len(points),
                 "warnings": scene.warnings,
             },
-            "versions": _versions(),
+            "versions": versions(),
         }
     )
     return transport
 
 
-def checked_settings(
-    lighting: CubemapLighting,
-    *,
-    method: str = "brute_force",
-    basis: str = "direction",
-    max_depth: int = 5,
-    spp: int = 16,
-    target_error: float | None = None,
-    seed: int = 0,
-    indirect_resolution: int | None = None,
-    strata: int = 2,
-) -> Settings:
-    """Check the arguments of ``precompute`` (see there for the meaning and the errors)."""
-    if method not in METHODS:
-        raise PrtError(f"unknown method {method!r}; choose one of: {', '.join(METHODS)}")
-    if basis not in ("direction", "texel"):
-        raise PrtError(f"unknown basis {basis!r}; choose 'direction' or 'texel'")
-    if max_depth < 2 and max_depth != -1:
-        raise PrtError(f"max_depth is {max_depth}; 2 is direct light only, -1 is no limit")
-    if target_error is not None and not target_error > 0:
-        raise PrtError(f"target_error is {target_error}; it must be positive, 0.02 for 2%")
-    for name, value in (("spp", spp), ("strata", strata)):
-        if value < 1 or value != int(value):
-            raise PrtError(f"{name} is {value}; it must be a whole number of at least 1")
-    coarse = CubemapLighting(lighting.resolution if indirect_resolution is None else indirect_resolution)
-    if coarse.resolution > lighting.resolution:
-        raise PrtError(
-            f"indirect_resolution {coarse.resolution} is finer than the lighting's; use at most {lighting.resolution}"
-        )
-    return Settings(method, basis, int(max_depth), int(spp), int(strata), coarse.resolution, int(seed))
+def _planned(
+    scene: Scene, lighting: CubemapLighting, settings: Settings, clock: Stopwatch
+) -> tuple[Settings, list[IndirectPlan]]:
+    """Settings with the resolution and samples of the indirect light that a target error needs."""
+    if settings.target_error is None or _no_indirect(scene, settings):
+        return settings, []
+    with clock.phase("plan"):
+        plans = plan_indirect(scene, lighting, settings)
+    return replace(settings, spp=plans[0].spp, indirect_resolution=plans[0].resolution), plans
 
 
-class Stopwatch:
-    """Seconds of named phases; what belongs to none is ``other``, so that they add up to the total."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._start = time.perf_counter()
-
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.add(name, time.perf_counter() - start)
-
-    def add(self, name: str, seconds: float) -> None:
-        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
-
-    def report(self) -> dict[str, float]:
-        """Phases, ``total`` (their sum), and apart from these ``compile``."""
-        elapsed = time.perf_counter() - self._start
-        phases = {**self.seconds, "other": elapsed - sum(self.seconds.values())}
-        compiling = phases.pop("compile", 0.0)
-        return {**phases, "total": elapsed - compiling, "compile": compiling}
-
-
-def _may_be_indirect(scene: Scene, settings: Settings) -> str | None:
+def _no_indirect(scene: Scene, settings: Settings) -> str | None:
     """Why there is no indirect light for sure, or None."""
     if settings.max_depth == 2:
         return "max_depth 2 asks for direct light only"
@@ -257,53 +158,100 @@ def _may_be_indirect(scene: Scene, settings: Settings) -> str | None:
 
 
 def _indirect_solver(
-    scene: Scene, lighting: CubemapLighting, settings: Settings
+    scene: Scene, settings: Settings, points: Points, clock: Stopwatch
 ) -> tuple[PathTransport | None, list[str]]:
     """The solver for indirect light if any can arrive, and what is skipped."""
-    reason = _may_be_indirect(scene, settings)
-    if reason:
-        return None, [f"indirect light: {reason}"]
-    solver = PathTransport(
-        scene.normalised,
-        CubemapLighting(settings.indirect_resolution),
-        vertex_points(scene),
-        # a coarse element stands for all directions in its texel
-        settings.basis if settings.indirect_resolution == lighting.resolution else "texel",
-        settings.max_depth,
-        settings.spp,
-        1 if scene.grey else 3,
-        settings.seed,
-    )
-    return solver, [
-        "two of three channels of the indirect light: every surface is grey"
-    ] if scene.grey else []
+    reason = _no_indirect(scene, settings)
+    if reason is None:
+        solver = PathTransport(
+            scene.normalised,
+            settings.coarse,
+            points,
+            settings.indirect_basis,
+            settings.max_depth,
+            settings.spp,
+            1 if scene.grey else 3,
+            settings.seed,
+        )
+        with clock.phase("pilot"):
+            surfaces_meet = solver.any_hit(_PILOT_RAYS)
+        if surfaces_meet:
+            grey = ["two of three channels of the indirect light: every surface is grey"]
+            return solver, grey if scene.grey else []
+        reason = "no surface sees another one"
+    return None, [f"indirect light: {reason}"]
+
+
+def _direct_part(
+    solver: DirectTransport, scene: Scene, clock: Stopwatch, progress: bool
+) -> Visibility | MeanCosine:
+    with clock.phase("direct"):
+        stored = solver.row_storage(len(solver.points))
+        _trace(solver, stored, solver.rows, "direct", progress)
+    if solver.basis == "direction":
+        return Visibility(stored.astype(np.uint32, copy=False), scene.normals, solver.lighting)
+    return MeanCosine(stored.astype(np.uint16, copy=False), solver.lighting)
 
 
 def _indirect_part(
-    solver: PathTransport, lighting: CubemapLighting, clock: Stopwatch, progress: bool
+    solver: PathTransport,
+    lighting: CubemapLighting,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None,
 ) -> Indirect:
-    n = len(solver.points)
     with clock.phase("indirect"):
-        density = _trace(
-            solver,
-            np.zeros((n, solver.lighting.n_directions, solver.channels), dtype=np.float16),
-            lambda ids: solver.rows(ids).mean,
-            "indirect",
-            progress,
-        )
+        shape = (len(solver.points), solver.lighting.n_directions, solver.channels)
+        density = np.zeros(shape, dtype=np.float16)
+        kept = Checkpoint(checkpoint, density) if checkpoint else None
+        _trace(solver, density, lambda ids: solver.rows(ids).mean, "indirect", progress, kept)
     return Indirect(density, upsampling(solver.lighting, lighting), lighting)
 
 
 def _trace(
-    solver: DirectTransport | PathTransport, stored: NDArray[Any], rows: Any, name: str, progress: bool
-) -> NDArray[Any]:
+    solver: DirectTransport | PathTransport,
+    stored: NDArray[Any],
+    rows: Callable[[NDArray[np.uint32]], NDArray[Any]],
+    name: str,
+    progress: bool,
+    kept: Checkpoint | None = None,
+) -> None:
     """Fill an array with all rows of a solver, one wavefront at a time."""
-    with tqdm(total=len(stored), desc=name, unit=" rows", disable=not progress) as bar:
-        for a in range(0, len(stored), solver.block_size):
+    first = kept.rows_done if kept else 0
+    with tqdm(total=len(stored), initial=first, desc=name, unit=" rows", disable=not progress) as bar:
+        for a in range(first, len(stored), solver.block_size):
             ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
             stored[a : a + len(ids)] = rows(ids)
+            if kept:
+                kept.append(stored[a : a + len(ids)])
             bar.update(len(ids))
-    return stored
+    if kept:
+        kept.remove()
+
+
+def _checkpoint_path(
+    folder: str | Path | None, scene: Scene, points: Points, settings: Settings
+) -> Path | None:
+    """A file name that stands for all that the rows of the indirect light, and their order, depend on."""
+    if folder is None:
+        return None
+    state = hashlib.sha256(f"{scene.hash} {settings}".encode() + points.keys.tobytes())
+    return Path(folder) / f"{state.hexdigest()[:32]}.rows"
+
+
+def _held_out_error(scene: Scene, transport: LightTransport, settings: Settings) -> dict[str, Any]:
+    """The matrix's error from held-out elements; warns if that shows a target error to be missed."""
+    indirect = transport.indirect is not None
+    held = HeldOut(scene, transport.lighting, transport.basis, settings.max_depth, indirect, settings.seed)
+    error = held.error(np.take_along_axis(transport.rows(held.vertices), held.texels[..., None], axis=1))
+    target = settings.target_error
+    if target is not None and error["total"] - 2 * error["standard_error"]["total"] > target:
+        warnings.warn(
+            f"the target error {target:g} was not met: the estimate is {error['total']:.3g}",
+            PrtWarning,
+            stacklevel=3,
+        )
+    return error
 
 
 def _forecast(
@@ -344,31 +292,18 @@ def _seconds_per_row(solver: DirectTransport | PathTransport, clock: Stopwatch) 
     return second / count
 
 
-def _share_above_horizon(normals: NDArray[np.float32], lighting: CubemapLighting) -> float:
-    """Share of all elements whose texel centre is above the vertex's horizon, from up to 1000 vertices."""
+def _evaluated(direct: DirectTransport, indirect: PathTransport | None, skipped: list[str]) -> dict[str, Any]:
+    """What was evaluated and what was not, for the report."""
+    lighting, normals = direct.lighting, direct.points.normals
+    elements = len(normals) * lighting.n_directions
     some = normals[:: max(1, len(normals) // 1000)]
-    return float((some @ lighting.directions.T > 0).mean())
-
-
-def _reset_peak_memory() -> None:
-    """Let the kernel forget the peak so far; where it cannot (not Linux), the report has that of the process."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        pass
-
-
-def _peak_memory() -> int:
-    """Peak resident bytes of the process."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024
-    return 0
-
-
-def _versions() -> dict[str, str]:
-    names = ("mi-sparse-prt", "mitsuba", "drjit", "numpy")
-    return {name: version(name) for name in names} | {
-        "python": platform.python_version(),
-        "variant": mi.variant(),
+    above = float((some @ lighting.directions.T > 0).mean())  # share of elements above the horizon
+    rays = {"direct": int(above * elements) * direct.rays_per_element}
+    if indirect:
+        rays["indirect_paths"] = len(normals) * indirect.lighting.n_directions * indirect.spp
+    return {
+        "elements_total": elements,
+        "elements_evaluated": elements,
+        "rays": rays,
+        "skipped": [*skipped, f"direct rays below the horizon: {1 - above:.0%} of the elements"],
     }

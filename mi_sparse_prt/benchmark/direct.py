@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.benchmark.kernels import recorded_kernels
+from mi_sparse_prt.cost import peak_memory, reset_peak_memory
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.precompute import _peak_memory, _reset_peak_memory
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 
@@ -85,7 +85,7 @@ def measure_direct(
     def fill(start: int, stop: int) -> None:
         bits[start:stop] = solver.rows(np.arange(start, stop, dtype=np.uint32))
 
-    _reset_peak_memory()
+    reset_peak_memory()
     begin = time.perf_counter()
     with recorded_kernels() as kernels:
         for block in blocks:
@@ -109,7 +109,7 @@ def measure_direct(
         "first_run_seconds": first_run,
         "kernels": kernels.report(),
         "matrix_bytes": bits.nbytes,
-        "peak_memory_bytes": _peak_memory(),
+        "peak_memory_bytes": peak_memory(),
         "visible": int(np.bitwise_count(bits).sum(dtype=np.int64)),
         "bare_visible": bare_visible,
     }, bits

@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import psutil
 
-from mi_sparse_prt.precompute import _versions
+from mi_sparse_prt.cost import versions
 
 
 def describe_machine() -> dict[str, Any]:
@@ -24,7 +24,7 @@ def describe_machine() -> dict[str, Any]:
             0
         ],  # above the number of cores: others were working, times are too long
         "system": platform.platform(),
-        "versions": _versions(),
+        "versions": versions(),
     }
 
 

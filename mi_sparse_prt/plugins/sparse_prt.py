@@ -45,6 +45,7 @@ class SparsePRT(mi.SamplingIntegrator):
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
     precompute_spp      integer    Paths per indirect element. (16)
     indirect_resolution integer    Texels along an edge of the indirect light's cubemap. (8, or ``resolution``)
+    target_error        float      Relative L2 error of the matrix to aim at; sets the two above. (0: none)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
@@ -65,6 +66,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "max_depth": props.get("max_depth", 5),
             "spp": props.get("precompute_spp", 16),
             "indirect_resolution": props.get("indirect_resolution", coarse),
+            "target_error": props.get("target_error", 0.0) or None,
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),
         }

@@ -1,0 +1,116 @@
+"""Small scenes that the tests of the core share, so that kernels are compiled once.
+
+Pure helpers are imported (``from conftest import diffuse``), what is expensive comes as session fixtures.
+"""
+
+from pathlib import Path
+
+import matplotlib
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.scene import Scene
+
+matplotlib.use("Agg")
+T = mi.ScalarTransform4f
+ARTEFACTS = Path(__file__).parent / "artefacts"
+GREY = ((0.5,) * 3, (0.6,) * 3, (0.7,) * 3)  # ground, ball, box
+COLOURS = ((0.8, 0.5, 0.2), (0.1, 0.4, 0.8), (0.3, 0.9, 0.3))
+
+
+def diffuse(*rgb: float) -> dict:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
+
+
+def mesh(name: str, vertices: np.ndarray, triangles: np.ndarray, bsdf: dict, smooth: bool = True) -> mi.Mesh:
+    """A Mitsuba mesh of these vertices (n, 3) and triangles (m, 3), with normals that Mitsuba makes if ``smooth``."""
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(bsdf)
+    result = mi.Mesh(name, len(vertices), len(triangles), has_vertex_normals=smooth, props=properties)
+    parameters = mi.traverse(result)
+    parameters["vertex_positions"] = mi.Float(np.asarray(vertices, np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.asarray(triangles, np.uint32).ravel())
+    parameters.update()
+    return result
+
+
+def bumpy_ball(rings: int = 8, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a closed ball of radius 0.4 to 0.6 that shadows itself; the poles are vertices."""
+    theta, phi = np.meshgrid(
+        np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(segments) / segments, indexing="ij"
+    )
+    radius = 0.5 + 0.1 * np.sin(3 * theta) * np.cos(4 * phi)
+    ring_points = np.stack(
+        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1
+    )  # [ring, segment, xyz]
+    vertices = np.concatenate(
+        [[[0, 0.5, 0]], (ring_points * radius[..., None]).reshape(-1, 3), [[0, -0.5, 0]]]
+    )
+    index = 1 + np.arange((rings - 1) * segments).reshape(rings - 1, segments)
+    right = np.roll(index, -1, axis=1)
+    last = np.full(segments, len(vertices) - 1)
+    triangles = [
+        np.stack([np.zeros(segments, int), right[0], index[0]], axis=-1),
+        *(np.stack([a, b, c], -1).reshape(-1, 3) for a, b, c in _strips(index, right)),
+        np.stack([last, index[-1], right[-1]], axis=-1),
+    ]
+    return vertices, np.concatenate(triangles)
+
+
+def _strips(index: np.ndarray, right: np.ndarray) -> list:
+    return [(index[:-1], right[:-1], index[1:]), (right[:-1], right[1:], index[1:])]
+
+
+def still_life(albedos: tuple = GREY, place: mi.ScalarTransform4f | None = None) -> dict:
+    """A bumpy ball and a turned box over an open ground; nothing touches, nothing is coplanar."""
+    place = place or T()
+    ground, ball, box = (diffuse(*rgb) for rgb in albedos)
+    vertices, triangles = bumpy_ball()
+    vertices = vertices + [-0.4, 0.7, 0]
+    vertices = vertices @ np.array(place.matrix)[:3, :3].T + np.array(place.matrix)[:3, 3]
+    return {
+        "ground": {
+            "type": "rectangle",
+            "to_world": place @ T().rotate([1, 0, 0], -90).scale(1.5),
+            "bsdf": ground,
+        },
+        "ball": mesh("ball", vertices, triangles, ball),
+        "box": {
+            "type": "cube",
+            "to_world": place @ T().translate([0.65, 0.45, 0.2]).rotate([0.2, 1, 0], 30).scale(0.3),
+            "bsdf": box,
+        },
+    }
+
+
+def build(edge_length: float = 0.5, optimize: bool = False, **shapes: object) -> Scene:
+    return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=optimize), edge_length)
+
+
+@pytest.fixture(scope="session")
+def grey_scene() -> Scene:
+    return build(**still_life())
+
+
+@pytest.fixture(scope="session")
+def coloured_scene() -> Scene:
+    return build(**still_life(COLOURS))
+
+
+@pytest.fixture(scope="session")
+def small_lighting() -> prt.CubemapLighting:
+    return prt.CubemapLighting(4)
+
+
+@pytest.fixture
+def artefact(request: pytest.FixtureRequest):
+    """Save a matplotlib figure under the test's name in tests/artefacts (ignored by git)."""
+
+    def save(figure: object, suffix: str = "") -> None:
+        ARTEFACTS.mkdir(exist_ok=True)
+        name = "".join(c if c.isalnum() else "_" for c in request.node.name).strip("_")
+        figure.savefig(ARTEFACTS / f"{name}{suffix}.png", dpi=90, bbox_inches="tight")
+
+    return save
