@@ -88,8 +88,8 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
     broken = f"{path} is damaged or not a matrix file of mi_sparse_prt; precompute it again"
     try:
         store = zarr.storage.ZipStore(path, mode="r")
+        group = zarr.open_group(store, mode="r")  # a store that could not be opened cannot be closed
         try:
-            group = zarr.open_group(store, mode="r")
             attributes: dict[str, Any] = dict(group.attrs)
             if attributes.get("format") != FORMAT:
                 raise PrtError(broken)

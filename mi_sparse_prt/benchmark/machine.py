@@ -14,15 +14,13 @@ from mi_sparse_prt.cost import versions
 
 
 def describe_machine() -> dict[str, Any]:
-    """``cpu``, ``cores`` that this process may use, ``memory_bytes``, ``load`` before and now, ``versions``."""
+    """Facts for a report; ``load_average`` above ``cores`` means that others were working and times are too long."""
     return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "drjit_threads": dr.thread_count(),
         "memory_bytes": psutil.virtual_memory().total,
-        "load_average": os.getloadavg()[
-            0
-        ],  # above the number of cores: others were working, times are too long
+        "load_average": os.getloadavg()[0],
         "system": platform.platform(),
         "versions": versions(),
     }

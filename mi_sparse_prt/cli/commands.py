@@ -12,19 +12,17 @@ import typer
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.cli.files import image_bytes, npy_bytes, ply_bytes
-from mi_sparse_prt.cli.running import make_folder, prompt_interrupts, running
+from mi_sparse_prt.cli.running import check_folder, running
 from mi_sparse_prt.cli.tables import (
     benchmark_tables,
-    bytes_text,
-    duration_text,
     matrix_tables,
-    plain_table,
+    relighting_table,
     scene_report,
     scene_tables,
     validation_table,
 )
+from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.precompute import Stopwatch
 from mi_sparse_prt.variant import VARIANTS
 
 app = typer.Typer(
@@ -162,6 +160,14 @@ def precompute(
     ] = 2,
     edge_length: EdgeLength = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same matrix.")] = 0,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Keep finished rows of the indirect light there: the same command after an interruption goes on.",
+            show_default=False,
+        ),
+    ] = None,
     define: Define = None,
     variant: Variant = None,
     json_file: JsonFile = None,
@@ -177,8 +183,11 @@ def precompute(
     with running(json_file, quiet, outputs=[output]) as command:
         parameters = _definitions(define)
         loaded = prt.load_scene(scene, edge_length, **parameters)
+        if checkpoint is not None:
+            check_folder(checkpoint)
+            command.hint = f"; finished rows are in {checkpoint}, the same command goes on with them"
         coarse = min(8, resolution) if indirect_resolution is None else indirect_resolution
-        with prompt_interrupts():
+        with command.prompt_interrupts():
             transport = prt.precompute(
                 loaded,
                 prt.CubemapLighting(resolution),
@@ -190,6 +199,7 @@ def precompute(
                 progress=not quiet,
                 indirect_resolution=coarse,
                 strata=strata,
+                checkpoint_folder=checkpoint,
             )
         # what `relight` needs to load the same scene again
         transport.report["scene"] |= {
@@ -265,44 +275,33 @@ def relight(
     _check_suffix(vertices, (".npy", ".ply"), "--vertices")
     with running(json_file, quiet, outputs=[output, vertices]) as command:
         clock = Stopwatch()
-        with clock.phase("load"):
-            light = prt.load_environment(environment).rotated(rotate)
-            transport = prt.load_transport(matrix)
-            loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
-        with clock.phase("relight"):
-            radiance = transport.relight(light)  # [vertex, rgb]
+        report: dict[str, Any] = {"matrix": str(matrix), "rotation_degrees": rotate}
         files: dict[Path, bytes] = {}
-        report: dict[str, Any] = {
-            "matrix": str(matrix),
-            "environment": light.report,
-            "rotation_degrees": rotate,
-        }
-        if vertices is not None:
-            npy = vertices.suffix.lower() == ".npy"
-            files[vertices] = npy_bytes(radiance) if npy else ply_bytes(loaded, radiance)
-            mean = radiance.mean(axis=0).tolist()
-            report["vertices"] = {"path": str(vertices), "count": len(radiance), "mean": mean}
-        if output is not None:
-            with clock.phase("render"):
-                image = prt.render(loaded, transport, light, sensor, spp)  # [row, column, rgb]
-            files[output] = image_bytes(image, output.suffix.lower(), exposure)
-            height, width = image.shape[:2]
-            report["image"] = {
-                "path": str(output),
-                "width": width,
-                "height": height,
-                "mean": float(image.mean()),
-            }
+        with command.prompt_interrupts():
+            with clock.phase("load"):
+                light = prt.load_environment(environment).rotated(rotate)
+                transport = prt.load_transport(matrix)
+                loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
+            report["environment"] = light.report
+            with clock.phase("relight"):
+                radiance = transport.relight(light)  # [vertex, rgb]
+            if vertices is not None:
+                npy = vertices.suffix.lower() == ".npy"
+                files[vertices] = npy_bytes(radiance) if npy else ply_bytes(loaded, radiance)
+                report["vertices"] = {"path": str(vertices), "mean": radiance.mean(axis=0).tolist()}
+            if output is not None:
+                with clock.phase("render"):
+                    image = prt.render(loaded, transport, light, sensor, spp)  # [row, column, rgb]
+                files[output] = image_bytes(image, output.suffix.lower(), exposure)
+                report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
         for path, content in files.items():
             command.write(path, content)
         command.report = report | {"seconds": clock.report()}
-        table = plain_table(f"{matrix} under {environment}, turned by {rotate:g} degrees", "", "")
-        for phase in ("load", "relight", "render"):
-            if phase in clock.seconds:
-                table.add_row(phase, duration_text(clock.seconds[phase]))
-        for path, content in files.items():
-            table.add_row(str(path), bytes_text(len(content)))
-        command.show(table)
+        command.show(
+            relighting_table(
+                f"{matrix} under {environment}, turned by {rotate:g} degrees", clock.seconds, files
+            )
+        )
 
 
 @app.command()
@@ -336,10 +335,10 @@ def validate(
     """
     with running(json_file, quiet) as command:
         if output is not None:
-            make_folder(output)
+            check_folder(output)
         transport = prt.load_transport(matrix)
         loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
-        with prompt_interrupts():
+        with command.prompt_interrupts():
             result = prt.validate(
                 loaded, transport, n_rows=rows, n_columns=columns, spp=spp, seed=seed, progress=not quiet
             )
@@ -401,7 +400,7 @@ def benchmark(
 
     with running(json_file, quiet) as command:
         loaded = prt.load_scene(scene, edge_length, **_definitions(define))
-        with prompt_interrupts():
+        with command.prompt_interrupts():
             command.report = run_benchmark(
                 loaded, prt.CubemapLighting(resolution), repeats, progress=not quiet
             )

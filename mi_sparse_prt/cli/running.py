@@ -9,6 +9,7 @@ import signal
 import sys
 import tempfile
 import threading
+import traceback
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
@@ -32,6 +33,7 @@ class Command:
     def __init__(self, quiet: bool) -> None:
         self.report: dict[str, Any] = {}
         self.written: list[Path] = []
+        self.hint = ""  # what to do after an interruption
         self._console = Console(quiet=quiet, markup=False, emoji=False, highlight=False)
 
     def show(self, *tables: Table) -> None:
@@ -58,6 +60,40 @@ class Command:
             temporary.unlink(missing_ok=True)
         self.written.append(path)
 
+    def interrupted(self) -> str:
+        """What Ctrl-C left behind, in a line."""
+        done = ", ".join(map(str, self.written))
+        return f"interrupted; {done or 'nothing'} was written{self.hint}"
+
+    @contextmanager
+    def prompt_interrupts(self) -> Iterator[None]:
+        """End the process soon after Ctrl-C, inside a kernel too: Python alone would wait until that has ended.
+
+        Only for work during which no result is written: a thread ends the process without asking the main one.
+        """
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        usual = signal.set_wakeup_fd(writer)  # one byte per signal, its number, at once
+        finished = threading.Event()
+
+        def watch() -> None:
+            while not finished.is_set():
+                if os.read(reader, 1)[0] == signal.SIGINT and not finished.wait(GRACE):
+                    _complain(self.interrupted())
+                    os._exit(INTERRUPTED)
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            finished.set()
+            signal.set_wakeup_fd(usual)
+            os.write(writer, b"\0")
+            watcher.join()
+            os.close(reader)
+            os.close(writer)
+
 
 @contextmanager
 def running(json_file: str | None, quiet: bool, outputs: Iterable[Path | None] = ()) -> Iterator[Command]:
@@ -76,9 +112,9 @@ def running(json_file: str | None, quiet: bool, outputs: Iterable[Path | None] =
                 print(text)
             else:
                 command.write(Path(json_file), text.encode())
-    except KeyboardInterrupt:
-        done = ", ".join(map(str, command.written))
-        _complain(f"interrupted; {done + ' was written' if done else 'nothing was written'}")
+    except KeyboardInterrupt as interrupt:
+        traceback.clear_frames(interrupt.__traceback__)  # ends progress bars, so that the message comes last
+        _complain(command.interrupted())
         raise typer.Exit(INTERRUPTED) from None
     except PrtError as error:
         _complain(str(error))
@@ -91,36 +127,6 @@ def running(json_file: str | None, quiet: bool, outputs: Iterable[Path | None] =
     except MemoryError as error:
         _complain(f"out of memory ({error}); lower --resolution or --indirect-resolution")
         raise typer.Exit(FAILED) from None
-
-
-@contextmanager
-def prompt_interrupts() -> Iterator[None]:
-    """End the process soon after Ctrl-C, inside a kernel too: Python alone would wait until that has ended.
-
-    For work that has no file open: a thread ends the process without asking the main one.
-    """
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    usual = signal.set_wakeup_fd(writer)  # one byte per signal, its number, at once
-    finished = threading.Event()
-
-    def watch() -> None:
-        while not finished.is_set():
-            if os.read(reader, 1)[0] == signal.SIGINT and not finished.wait(GRACE):
-                _complain("interrupted; nothing was written")
-                os._exit(INTERRUPTED)
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        finished.set()
-        signal.set_wakeup_fd(usual)
-        os.write(writer, b"\0")
-        watcher.join()
-        os.close(reader)
-        os.close(writer)
 
 
 @contextmanager
@@ -177,10 +183,12 @@ def _check_writable(path: Path) -> None:
         ) from None
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder and see that files can be written there (`PrtError` if not)."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PrtError(f"cannot make the folder {path}: {_reason(error)}; choose another one") from None
-    _check_writable(path / "report.json")
+def check_folder(path: Path) -> None:
+    """Find out before the work whether files can be written into a folder, which may still have to be made.
+
+    Raises
+    ------
+    PrtError
+        If they cannot.
+    """
+    _check_writable(next(p for p in (path, *path.absolute().parents) if p.exists()) / "report.json")

@@ -11,7 +11,7 @@ from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.scene import Scene
 
 
-def plain_table(title: str, *columns: str) -> Table:
+def _table(title: str, *columns: str) -> Table:
     """A table whose first column is text, the others numbers."""
     table = Table(title=title, title_justify="left", show_header=any(columns))
     for k, column in enumerate(columns):
@@ -23,36 +23,34 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
     """What was done, how long it took, how good it is, and what was skipped."""
     report = transport.report
     vertices, directions, _ = transport.shape
-    done = plain_table(
-        f"{path}: {vertices} vertices x {directions} directions, {transport.basis} basis", "", ""
-    )
+    done = _table(f"{path}: {vertices} vertices x {directions} directions, {transport.basis} basis", "", "")
     for name, key in (("elements", "elements_total"), ("elements evaluated", "elements_evaluated")):
         done.add_row(name, f"{report[key]:,}")
     for name, count in report["rays"].items():
         done.add_row(
             {"direct": "shadow rays", "indirect_paths": "indirect paths"}.get(name, name), f"{count:,}"
         )
-    done.add_row("matrix in memory", bytes_text(transport.nbytes))
-    done.add_row("file", bytes_text(path.stat().st_size))
-    done.add_row("peak memory", bytes_text(report["peak_memory_bytes"]))
+    done.add_row("matrix in memory", _bytes(transport.nbytes))
+    done.add_row("file", _bytes(path.stat().st_size))
+    done.add_row("peak memory", _bytes(report["peak_memory_bytes"]))
     for name in ("max_depth", "spp", "indirect_resolution", "strata", "seed"):
         done.add_row(name, str(report["parameters"][name]))
     for name in ("path", "hash"):
         done.add_row(f"scene {name}", str(report["scene"][name]))
     done.add_row("versions", ", ".join(f"{name} {number}" for name, number in report["versions"].items()))
 
-    phases = plain_table("Time", "phase", "time", "share")
+    phases = _table("Time", "phase", "time", "share")
     total = report["seconds"]["total"]
     for name, seconds in report["seconds"].items():
         if name not in ("total", "compile"):
-            phases.add_row(name, duration_text(seconds), f"{seconds / total:.0%}")
+            phases.add_row(name, _duration(seconds), f"{seconds / total:.0%}")
     phases.add_section()
-    phases.add_row("total", duration_text(total), "")
-    phases.add_row("compile, apart", duration_text(report["seconds"]["compile"]), "")
-    phases.add_row("forecast", duration_text(report["forecast"]["seconds"]), "")
+    phases.add_row("total", _duration(total), "")
+    phases.add_row("compile, apart", _duration(report["seconds"]["compile"]), "")
+    phases.add_row("forecast", _duration(report["forecast"]["seconds"]), "")
 
     error = report["estimated_error"]
-    quality = plain_table(
+    quality = _table(
         "Estimated error (relative L2, from held-out elements)", "mesh", "vertices", "error", "+-"
     )
     for mesh in transport.meshes:
@@ -63,8 +61,9 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
     quality.add_row(
         "total", f"{vertices:,}", _share(error["total"]), _share(error["standard_error"]["total"])
     )
-    if report.get("target_error") is not None:
-        quality.add_row("target", "", _share(report["target_error"]), "")
+    target = report["parameters"]["target_error"]
+    if target is not None:
+        quality.add_row("target", "", _share(target), "")
     tables = [done, phases, quality]
     for title, sentences in (("Skipped", report["skipped"]), ("Warnings", report["scene"]["warnings"])):
         if sentences:
@@ -73,7 +72,7 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
 
 
 def _sentences(title: str, sentences: list[str]) -> Table:
-    table = plain_table(title, "")
+    table = _table(title, "")
     for sentence in sentences:
         table.add_row(sentence)
     return table
@@ -82,28 +81,38 @@ def _sentences(title: str, sentences: list[str]) -> Table:
 def scene_tables(scene: Scene) -> list[Table]:
     """What a scene consists of, and what its matrix would take."""
     report = scene_report(scene)
-    meshes = plain_table(
+    meshes = _table(
         f"{scene.path}: {report['vertices']:,} vertices", "mesh", "vertices", "triangles", "mean albedo"
     )
     for mesh in scene.meshes:
         sizes = report["meshes"][mesh.name]
         albedo = " ".join(f"{value:.3f}" for value in scene.albedo[mesh.vertices].mean(axis=0))
         meshes.add_row(mesh.name, f"{sizes['vertices']:,}", f"{sizes['triangles']:,}", albedo)
-    facts = plain_table("Scene", "", "")
+    facts = _table("Scene", "", "")
     low, high = report["box"]
     facts.add_row(
         "box", " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (low, high))
     )
     facts.add_row("grey, so one channel of indirect light", "yes" if scene.grey else "no")
     facts.add_row("diffuse only", "yes" if scene.diffuse else "no")
-    facts.add_row("direct matrix, 6 x 32 x 32 directions", bytes_text(report["vertices"] * 6144 // 8))
+    facts.add_row("direct matrix, 6 x 32 x 32 directions", _bytes(report["vertices"] * 6144 // 8))
     facts.add_row("hash", scene.hash)
     return [meshes, facts, *([_sentences("Warnings", scene.warnings)] if scene.warnings else [])]
 
 
+def relighting_table(title: str, seconds: dict[str, float], files: dict[Path, bytes]) -> Table:
+    """How long each step took, and what was written."""
+    table = _table(title, "", "")
+    for phase, duration in seconds.items():
+        table.add_row(phase, _duration(duration))
+    for path, content in files.items():
+        table.add_row(str(path), _bytes(len(content)))
+    return table
+
+
 def validation_table(report: dict[str, Any], title: str) -> Table:
     """Errors of rows, columns and image, and the reference's own noise (see ``Validation``)."""
-    table = plain_table(title, "relative L2 unless said otherwise", "")
+    table = _table(title, "relative L2 unless said otherwise", "")
     for mesh, error in report["relative_l2"]["meshes"].items():
         table.add_row(f"mesh {mesh}", _share(error))
     table.add_row("total", _share(report["relative_l2"]["total"]))
@@ -127,34 +136,34 @@ def validation_table(report: dict[str, Any], title: str) -> Table:
 def benchmark_tables(report: dict[str, Any]) -> list[Table]:
     """What ``run_benchmark`` measured, and on which machine."""
     machine, direct, paths, relit = (report[part] for part in ("machine", "direct", "paths", "relight"))
-    rays = plain_table(
+    rays = _table(
         f"Direct matrix, {report['scene']['vertices']:,} vertices x {report['scene']['directions']} directions",
         "",
         "",
     )
-    rays.add_row("matrix, bits on the host", duration_text(direct["seconds"]))
-    rays.add_row("the same rays and a count", duration_text(direct["bare_seconds"]))
+    rays.add_row("matrix, bits on the host", _duration(direct["seconds"]))
+    rays.add_row("the same rays and a count", _duration(direct["bare_seconds"]))
     rays.add_row("ratio", f"{direct['ratio']:.3f}")
     rays.add_row("rays above the horizon", f"{direct['rays_per_second'] / 1e6:.1f} M/s")
-    rays.add_row("peak memory", bytes_text(direct["peak_memory_bytes"]))
+    rays.add_row("peak memory", _bytes(direct["peak_memory_bytes"]))
     rays.add_row(*_kernel_row(direct["kernels"], direct["blocks"]))
-    rays.add_row("first run, compilation included", duration_text(direct["first_run_seconds"]))
+    rays.add_row("first run, compilation included", _duration(direct["first_run_seconds"]))
 
-    walks = plain_table(
+    walks = _table(
         f"Indirect light, max_depth {paths['max_depth']}, {paths['spp']} paths per element", "", ""
     )
     for name, label in (("rows", "whole rows"), ("scattered", "scattered elements")):
         walks.add_row(label, f"{paths[name]['paths_per_second'] / 1e6:.2f} M paths/s")
         walks.add_row(*_kernel_row(paths[name]["kernels"], paths["blocks"]))
-        walks.add_row("first run, compilation included", duration_text(paths[name]["first_run_seconds"]))
-    walks.add_row("whole matrix by this", duration_text(paths["whole_matrix_seconds"]))
+        walks.add_row("first run, compilation included", _duration(paths[name]["first_run_seconds"]))
+    walks.add_row("whole matrix by this", _duration(paths["whole_matrix_seconds"]))
 
-    frames = plain_table("Relighting all vertices", "", "")
-    frames.add_row("direct light", duration_text(relit["direct"]["seconds"]))
+    frames = _table("Relighting all vertices", "", "")
+    frames.add_row("direct light", _duration(relit["direct"]["seconds"]))
     label = f"with indirect light, 6 x {relit['indirect_resolution']}^2, {relit['channels']} channel(s)"
-    frames.add_row(label, duration_text(relit["with_indirect"]["seconds"]))
+    frames.add_row(label, _duration(relit["with_indirect"]["seconds"]))
 
-    host = plain_table("Machine", "", "")
+    host = _table("Machine", "", "")
     host.add_row(
         "processor", f"{machine['cpu']}, {machine['cores']} cores, {machine['drjit_threads']} Dr.Jit threads"
     )
@@ -174,15 +183,13 @@ def _share(value: float) -> str:
     return f"{value:.2%}" if value >= 1e-3 or value == 0 else f"{value:.1e}"
 
 
-def duration_text(seconds: float) -> str:
-    """Seconds, in a unit that people read."""
+def _duration(seconds: float) -> str:
     if seconds < 0.1:
         return f"{seconds * 1e3:.1f} ms"
     return f"{seconds:.2f} s" if seconds < 600 else f"{seconds / 60:.0f} min"
 
 
-def bytes_text(count: float) -> str:
-    """A number of bytes, in a unit that people read."""
+def _bytes(count: float) -> str:
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.1f} {unit}"

@@ -55,8 +55,7 @@ def vertex_points(scene: Scene) -> Points:
     """
     positions = scene.normalised_positions
     triangles = np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
-    border = np.flatnonzero(_border_vertices(triangles))
-    centre = _mean_of_triangles(positions, triangles)[border]
+    border, centre = _centres_beside_border(positions, triangles)
     inwards = centre - positions[border]  # [border vertex, xyz]
     length = np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-30)
     offset = (
@@ -70,17 +69,33 @@ def vertex_points(scene: Scene) -> Points:
     return Points(moved, scene.normals, scene.normals, hash_rows(moved, scene.vertex_keys))
 
 
-def _mean_of_triangles(positions: NDArray[np.float32], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Mean of the centroids of every vertex's triangles, (n_v, 3).
+def _centres_beside_border(
+    positions: NDArray[np.float32], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Border vertices, and the centre of the widest triangle of each: a point of the surface, on folds too.
 
-    Sums of float32 in float64 are exact here, so the order of triangles and corners does not show.
+    Among triangles of equal width the one of smallest coordinates is taken, and sums of three float32 are exact in
+    float64, so that neither the order of triangles nor that of their corners shows.
     """
-    sums = positions.astype(np.float64)[triangles].sum(axis=1)  # [triangle, xyz]
-    total, count = np.zeros(positions.shape), np.zeros(len(positions))
-    for corner in range(3):
-        np.add.at(total, triangles[:, corner], sums)
-        np.add.at(count, triangles[:, corner], 1)
-    return total / (3 * np.maximum(count, 1))[:, None]
+    owners = triangles.ravel()
+    chosen = np.flatnonzero(_border_vertices(triangles)[owners])
+    owners, face = owners[chosen], chosen // 3
+    width = _widths(positions[triangles])[face]
+    widest = np.zeros(len(positions))
+    np.maximum.at(widest, owners, width)
+    wide = width >= 0.999 * widest[owners]  # equal but for rounding
+    owners, face = owners[wide], face[wide]
+    sums = positions.astype(np.float64)[triangles[face]].sum(axis=1)  # [corner, xyz]
+    order = np.lexsort((*sums.T, owners))
+    border, first = np.unique(owners[order], return_index=True)
+    return border, sums[order][first] / 3
+
+
+def _widths(corners: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Room in triangles (t, 3, 3): height over the longest edge."""
+    p = corners.astype(np.float64)
+    longest = np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2).max(axis=1)
+    return np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1) / longest
 
 
 def _border_vertices(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -166,14 +181,10 @@ def _merged(scene: mi.Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 def _triangles_of_vertices(
     vertices: NDArray[np.float32], triangles: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """List every corner with its vertex and its rank there: the corner with the widest room (2 area / longest edge)
-    of each vertex has rank 0."""
-    p = vertices[triangles].astype(np.float64)  # [triangle, corner, xyz]
-    edges = np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2)  # [triangle, edge]
-    room = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1) / edges.max(axis=1)
+    """List every corner with its vertex and its rank there: the corner in the widest triangle has rank 0."""
     owners = triangles.reshape(-1)
     corners = np.arange(len(owners))
-    order = np.lexsort((-np.repeat(room, 3), owners))
+    order = np.lexsort((-np.repeat(_widths(vertices[triangles]), 3), owners))
     owners, corners = owners[order], corners[order]
     first = np.searchsorted(owners, owners)  # index of each vertex's first corner
     return owners, np.arange(len(owners)) - first, corners

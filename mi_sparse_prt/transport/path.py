@@ -125,9 +125,11 @@ class PathTransport:
         rng = random_generator(self._points.key(point), texel, lane - element * self.spp, seed)
         radiance = self._radiance(point, texel, rng)
         samples = [radiance[c] for c in range(self.channels)]
-        sums = [dr.block_reduce(dr.ReduceOp.Add, x, self.spp) for x in samples]
-        squares = [dr.block_reduce(dr.ReduceOp.Add, x * x, self.spp) for x in samples]
-        dr.eval(sums, squares)
+        powers = [x * x for x in samples]
+        dr.eval(samples, powers)  # in one kernel
+        sums, squares = (
+            [dr.block_reduce(dr.ReduceOp.Add, x, self.spp) for x in xs] for xs in (samples, powers)
+        )
         mean = np.stack([x.numpy() for x in sums], axis=-1) / self.spp
         second = np.stack([x.numpy() for x in squares], axis=-1) / self.spp
         variance = np.maximum(second - mean**2, 0) / max(self.spp - 1, 1)

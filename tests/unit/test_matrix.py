@@ -1,0 +1,262 @@
+"""The factored matrix against slow, obvious formulas on made-up factors: no ray is traced here."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse
+from conftest import build, diffuse, still_life
+from numpy.typing import NDArray
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.measurement.vertices import vertex_points
+
+N_V, N = 50, 4
+FORMS = ["bits", "fixed point", "bits and coarse indirect", "fixed point and full indirect"]
+
+
+def made_up(form: str, n: int = N, n_vertices: int = N_V) -> LightTransport:
+    rng = np.random.default_rng(7)
+    lighting = prt.CubemapLighting(n)
+    m = lighting.n_directions
+    normals = rng.normal(size=(n_vertices, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    if form.startswith("bits"):
+        bits = rng.integers(0, 1 << 32, (n_vertices, -(-m // 32)), dtype=np.uint32)
+        bits[:, -1] &= (1 << (m % 32)) - 1 if m % 32 else 0xFFFFFFFF
+        direct = Visibility(bits, normals, lighting)
+    else:
+        direct = MeanCosine(rng.integers(0, 1 << 16, (n_vertices, m), dtype=np.uint16), lighting)
+    indirect = None
+    if "indirect" in form:
+        coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
+        channels = 1 if "full" in form else 3
+        density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
+        indirect = Indirect(density, upsampling(coarse, lighting), lighting)
+    return LightTransport(
+        lighting=lighting,
+        basis="direction" if form.startswith("bits") else "texel",
+        albedo=rng.random((n_vertices, 3), dtype=np.float32),
+        direct=direct,
+        indirect=indirect,
+        meshes=(MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices))),
+        vertex_keys=rng.integers(0, 1 << 63, n_vertices, dtype=np.uint64),
+        scene_hash="made up",
+        report={"parameters": {"max_depth": 5}},
+    )
+
+
+def slow(transport: LightTransport) -> NDArray[np.float64]:
+    """T, element by element, in float64 from the definitions of DESIGN 2."""
+    lighting = transport.lighting
+    result = np.zeros(transport.shape)
+    for i in range(transport.shape[0]):
+        for j in range(transport.shape[1]):
+            solid_angle = float(lighting.solid_angles[j])
+            if transport.basis == "direction":
+                visible = (int(transport.direct.bits[i, j // 32]) >> (j % 32)) & 1
+                cosine = float(transport.direct.normals[i].astype(float) @ lighting.directions[j].astype(float))
+                white = np.full(3, visible * max(0.0, cosine) * solid_angle / np.pi)
+            else:
+                white = np.full(3, transport.direct.fixed[i, j] / 65535 * solid_angle / np.pi)
+            if transport.indirect is not None:
+                weights = transport.indirect.upsampling.toarray()[j]
+                white += solid_angle * (weights @ transport.indirect.density[i].astype(float))
+            result[i, j] = transport.albedo[i] * white
+    return result
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def transport(request: pytest.FixtureRequest) -> LightTransport:
+    return made_up(request.param)
+
+
+@pytest.fixture(scope="module")
+def full(transport: LightTransport) -> NDArray[np.float64]:
+    return slow(transport)
+
+
+def close(a: NDArray, b: NDArray) -> bool:
+    """Within 1e-6, relative to the size of the whole."""
+    return bool(np.abs(a - b).max() <= 1e-6 * np.abs(b).max()) and a.shape == b.shape
+
+
+def test_rows_columns_and_relight_are_one_matrix(transport, full):
+    rows = transport.rows(np.arange(N_V))
+    columns = transport.columns(np.arange(6 * N * N))
+    assert rows.dtype == columns.dtype == np.float32
+    assert rows.shape == columns.shape == transport.shape == (N_V, 6 * N * N, 3)
+    assert close(rows, full)
+    assert close(columns, full)
+    L = np.random.default_rng(0).random((6 * N * N, 3), dtype=np.float32)
+    relit = transport.relight(L)
+    assert relit.dtype == np.float32
+    assert relit.shape == (N_V, 3)
+    assert close(relit, np.einsum("ijc,jc->ic", full, L))
+    assert np.array_equal(relit, transport.albedo * transport.irradiance(L))
+
+
+def test_a_single_texel_lights_its_column(transport):
+    for j in (0, 31, 32, 95):
+        L = np.zeros((6 * N * N, 3), np.float32)
+        L[j] = [1, 2, 3]
+        assert close(transport.relight(L), transport.columns([j])[:, 0] * [1, 2, 3])
+
+
+def test_relight_is_linear(transport):
+    rng = np.random.default_rng(1)
+    L1, L2 = rng.random((2, 6 * N * N, 3), dtype=np.float32)
+    both = transport.relight(np.float32(0.25) * L1 + np.float32(3) * L2)
+    assert close(both, 0.25 * transport.relight(L1) + 3 * transport.relight(L2))
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [[3, 1, 2], [3, 3, 3], [-1, 0, -2], 7, np.int64(7), np.arange(5, dtype=np.uint8), range(4), (1, 2)],
+    ids=str,
+)
+def test_ways_to_say_which(transport, full, ids):
+    chosen = np.atleast_1d(np.asarray(ids)).astype(int)
+    assert close(transport.rows(ids), full[chosen])
+    assert close(transport.columns(ids), full[:, chosen])
+
+
+def test_nothing_asked_nothing_given(transport):
+    for nothing in ([], np.zeros(0, int), np.zeros(N_V, bool)):
+        assert transport.rows(nothing).shape == (0, 6 * N * N, 3)
+    for nothing in ([], np.zeros(0, int), np.zeros(6 * N * N, bool)):
+        assert transport.columns(nothing).shape == (N_V, 0, 3)
+
+
+def test_masks(transport, full):
+    rows, columns = np.arange(N_V) % 3 == 0, np.arange(6 * N * N) % 5 == 0
+    assert close(transport.rows(rows), full[rows])
+    assert close(transport.columns(columns), full[:, columns])
+
+
+@pytest.mark.parametrize("wrong", [N_V, -N_V - 1, [0, 10**9], [0.5], [[0, 1]], "a", [np.nan], None])
+def test_bad_vertices_are_refused(transport, wrong):
+    with pytest.raises(prt.PrtError, match="vertex id"):
+        transport.rows(wrong)
+
+
+@pytest.mark.parametrize("wrong", [6 * N * N, -6 * N * N - 1, [1.0]])
+def test_bad_directions_are_refused(transport, wrong):
+    with pytest.raises(prt.PrtError, match="direction id"):
+        transport.columns(wrong)
+
+
+@pytest.mark.parametrize("length", [2, N_V + 1])
+def test_a_mask_of_another_length_is_refused(transport, length):
+    """As NumPy does: such a mask was made for something else."""
+    with pytest.raises(prt.PrtError, match="vertex"):
+        transport.rows(np.ones(length, bool))
+
+
+def test_the_message_names_the_id_that_is_out_of_range(transport):
+    with pytest.raises(prt.PrtError, match="-1000"):
+        transport.rows([5, -1000])
+    with pytest.raises(prt.PrtError, match=f"1000 is out of range: there are {N_V}"):
+        transport.rows([-1, 1000])
+
+
+def test_ways_to_say_the_lighting(transport, full):
+    constant = np.einsum("ijc->ic", full)
+    n = transport.lighting.resolution
+    assert close(transport.relight(1.0), constant)
+    assert close(transport.relight([1, 2, 3]), constant * [1, 2, 3])
+    assert close(transport.relight(np.ones((6, n, n, 3))), constant)
+    assert close(transport.relight(prt.Environment(np.ones((8, 16, 3), np.float32))), constant)
+    for wrong in (np.ones(7), np.full((6 * n * n, 3), np.nan), np.ones((6 * n * n, 4))):
+        with pytest.raises(prt.PrtError):
+            transport.relight(wrong)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_padding_bits_are_never_read(n):
+    """6 and 24 directions leave 26 and 8 bits of the last word unused."""
+    transport = made_up("bits", n)
+    dirty = transport.direct.bits.copy()
+    dirty[:, -1] |= np.uint32(0xFFFFFFFF << (6 * n * n % 32) & 0xFFFFFFFF)
+    dirty = replace(transport, direct=replace(transport.direct, bits=dirty))
+    assert (dirty.direct.bits != transport.direct.bits).any()
+    assert np.array_equal(dirty.rows([0, 1]), transport.rows([0, 1]))
+    assert np.array_equal(dirty.relight(1.0), transport.relight(1.0))
+    assert close(transport.rows(np.arange(N_V)), slow(transport))
+
+
+def test_many_blocks_of_rows():
+    """More vertices than a block of the product: the seams do not show."""
+    transport = made_up("fixed point and full indirect", 1, 9001)
+    rows = transport.rows(np.arange(9001))
+    assert close(transport.relight([1, 2, 3]), (rows.astype(np.float64) * [1, 2, 3]).sum(axis=1))
+
+
+def test_bytes_are_those_of_the_factors():
+    sizes = {form: made_up(form).nbytes for form in FORMS}
+    assert sizes["bits"] == N_V * 96 / 8
+    assert sizes["fixed point"] == N_V * 96 * 2
+    assert sizes["bits and coarse indirect"] == sizes["bits"] + N_V * 24 * 3 * 2
+    assert sizes["fixed point and full indirect"] == sizes["fixed point"] + N_V * 96 * 2
+
+
+# ------------------------------------------------------------------------------------ other vertex orders
+
+
+def test_rows_follow_the_order_of_a_scenes_vertices():
+    """The same three shapes in another order, and merged by Mitsuba: rows come in the asking scene's order."""
+    shapes = still_life(((0.5,) * 3,) * 3)
+    scene = build(**shapes)
+    keys = vertex_points(scene).keys
+    transport = replace(
+        made_up("bits and coarse indirect", n_vertices=scene.n_vertices),
+        albedo=scene.albedo,
+        vertex_keys=keys,
+        scene_hash=scene.hash,
+        meshes=tuple(MeshRange(m.name, m.vertices) for m in scene.meshes),
+    )
+    transport = replace(transport, direct=replace(transport.direct, normals=scene.normals))
+    assert transport.for_scene(scene) is transport
+
+    other = build(**dict(reversed(list(shapes.items()))))
+    merged = build(optimize=True, **shapes)
+    assert [m.name for m in other.meshes] == ["box", "ball", "ground"]
+    for target in (other, merged):
+        turned = transport.for_scene(target)
+        assert [m.name for m in turned.meshes] == [m.name for m in target.meshes]
+        assert [m.vertices for m in turned.meshes] == [m.vertices for m in target.meshes]
+        row_of = {tuple(p): i for i, p in enumerate(np.c_[scene.positions, scene.normals].tolist())}
+        source = [row_of[tuple(p)] for p in np.c_[target.positions, target.normals].tolist()]
+        assert not np.array_equal(source, np.arange(len(source))) or target is merged
+        assert np.array_equal(turned.rows(np.arange(len(source))), transport.rows(source))
+        assert np.array_equal(turned.relight([1, 2, 3]), transport.relight([1, 2, 3])[source])
+
+
+def test_a_matrix_of_another_scene_is_refused(grey_scene):
+    with pytest.raises(prt.PrtError, match="belongs to another scene"):
+        made_up("bits").for_scene(grey_scene)
+    same_shapes = build(**still_life(((0.5,) * 3, (0.6,) * 3, (0.71,) * 3)))
+    transport = replace(made_up("bits"), scene_hash=grey_scene.hash)
+    with pytest.raises(prt.PrtError, match="belongs to another scene"):
+        transport.for_scene(same_shapes)
+
+
+def test_a_matrix_of_other_vertices_of_the_scene_is_refused():
+    """Right hash, but the keys are not the scene's (an altered file)."""
+    scene = build(ball={"type": "cube", "bsdf": diffuse(1, 1, 1)})
+    transport = replace(made_up("bits", n_vertices=scene.n_vertices), scene_hash=scene.hash)
+    with pytest.raises(prt.PrtError):
+        transport.for_scene(scene)
+
+
+def test_upsampling_may_have_any_sparsity():
+    """Columns and relight read the interpolation matrix in two ways: by rows and transposed."""
+    transport = made_up("bits and coarse indirect")
+    random = scipy.sparse.random_array((96, 24), density=0.3, rng=np.random.default_rng(3), dtype=np.float32).tocsr()
+    transport = replace(transport, indirect=replace(transport.indirect, upsampling=random))
+    full = slow(transport)
+    assert close(transport.columns(np.arange(96)), full)
+    assert close(transport.columns([5]), full[:, [5]])
+    assert close(transport.relight(1.0), full.sum(axis=1))
