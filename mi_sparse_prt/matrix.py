@@ -358,14 +358,18 @@ class LightTransport:
 
 
 def _checked(ids: ArrayLike, count: int, what: str) -> Rows:
+    """Ids as indices below ``count``; a mask of that length and negative ids mean what they do in NumPy."""
     chosen = np.atleast_1d(np.asarray(ids))
-    if chosen.dtype == bool:
-        chosen = np.flatnonzero(chosen)
+    if chosen.dtype == bool and chosen.shape == (count,):
+        return np.flatnonzero(chosen)
     if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
-        raise PrtError(f"{what} ids must be a list of integers, not {chosen.dtype} of shape {chosen.shape}")
+        raise PrtError(
+            f"{what} ids must be a list of integers or a mask of {count}, not {chosen.dtype} of shape {chosen.shape}"
+        )
     chosen = chosen.astype(np.int64)
-    if chosen.size and (chosen.min() < -count or chosen.max() >= count):
-        raise PrtError(f"{what} id {chosen.max()} is out of range: there are {count}")
+    outside = (chosen < -count) | (chosen >= count)
+    if outside.any():
+        raise PrtError(f"{what} id {chosen[outside][0]} is out of range: there are {count}")
     return np.where(chosen < 0, chosen + count, chosen)
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.scene import Scene
 
 matplotlib.use("Agg")
@@ -18,6 +20,7 @@ T = mi.ScalarTransform4f
 ARTEFACTS = Path(__file__).parent / "artefacts"
 GREY = ((0.5,) * 3, (0.6,) * 3, (0.7,) * 3)  # ground, ball, box
 COLOURS = ((0.8, 0.5, 0.2), (0.1, 0.4, 0.8), (0.3, 0.9, 0.3))
+FORMS = ("bits", "fixed point", "bits and coarse indirect", "fixed point and full indirect")
 
 
 def diffuse(*rgb: float) -> dict:
@@ -87,6 +90,38 @@ def still_life(albedos: tuple = GREY, place: mi.ScalarTransform4f | None = None)
 
 def build(edge_length: float = 0.5, optimize: bool = False, **shapes: object) -> Scene:
     return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=optimize), edge_length)
+
+
+def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
+    """A matrix of random factors in one of the forms that it is stored in; no scene is behind it."""
+    rng = np.random.default_rng(7)
+    lighting = prt.CubemapLighting(n)
+    m = lighting.n_directions
+    normals = rng.normal(size=(n_vertices, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    if form.startswith("bits"):
+        bits = rng.integers(0, 1 << 32, (n_vertices, -(-m // 32)), dtype=np.uint32)
+        bits[:, -1] &= (1 << (m % 32)) - 1 if m % 32 else 0xFFFFFFFF
+        direct = Visibility(bits, normals, lighting)
+    else:
+        direct = MeanCosine(rng.integers(0, 1 << 16, (n_vertices, m), dtype=np.uint16), lighting)
+    indirect = None
+    if "indirect" in form:
+        coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
+        channels = 1 if "full" in form else 3
+        density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
+        indirect = Indirect(density, upsampling(coarse, lighting), lighting)
+    return LightTransport(
+        lighting=lighting,
+        basis="direction" if form.startswith("bits") else "texel",
+        albedo=rng.random((n_vertices, 3), dtype=np.float32),
+        direct=direct,
+        indirect=indirect,
+        meshes=(MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices))),
+        vertex_keys=rng.integers(0, 1 << 63, n_vertices, dtype=np.uint64),
+        scene_hash="made up",
+        report={"parameters": {"max_depth": 5}},
+    )
 
 
 @pytest.fixture(scope="session")

@@ -50,10 +50,10 @@ def recorded_kernels() -> Iterator[Kernels]:
         found.launches += 1
         found.hashes.add(kernel["hash"])
         found.compile_seconds += (kernel["codegen_time"] + kernel["backend_time"]) / 1e3
-        if kernel["cache_hit"]:
-            found.in_memory += 1
-        elif kernel["cache_disk"]:
+        if kernel["cache_disk"]:  # this too is a cache_hit to Dr.Jit
             found.on_disk += 1
+        elif kernel["cache_hit"]:
+            found.in_memory += 1
         else:
             found.compiled += 1
     found.distinct = len(found.hashes)

@@ -124,7 +124,8 @@ def test_a_baked_offset_would_be_found():
     def block(offset, size):
         return dr.eval(dr.gather(mi.Float, values, dr.arange(mi.UInt32, size) + offset) * 2)
 
-    assert kernels_of(lambda: [block(a, b - a) for a, b in BLOCKS]).distinct == len(BLOCKS)
+    baked = kernels_of(lambda: [block(a, b - a) for a, b in BLOCKS])
+    assert baked.distinct == len(BLOCKS) == baked.compiled + baked.on_disk
     assert kernels_of(lambda: [block(dr.opaque(mi.UInt32, a), b - a) for a, b in BLOCKS]).distinct == 1
 
 

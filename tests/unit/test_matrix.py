@@ -5,47 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import build, diffuse, still_life
+from conftest import FORMS, build, diffuse, made_up, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.matrix import LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import vertex_points
 
 N_V, N = 50, 4
-FORMS = ["bits", "fixed point", "bits and coarse indirect", "fixed point and full indirect"]
-
-
-def made_up(form: str, n: int = N, n_vertices: int = N_V) -> LightTransport:
-    rng = np.random.default_rng(7)
-    lighting = prt.CubemapLighting(n)
-    m = lighting.n_directions
-    normals = rng.normal(size=(n_vertices, 3))
-    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    if form.startswith("bits"):
-        bits = rng.integers(0, 1 << 32, (n_vertices, -(-m // 32)), dtype=np.uint32)
-        bits[:, -1] &= (1 << (m % 32)) - 1 if m % 32 else 0xFFFFFFFF
-        direct = Visibility(bits, normals, lighting)
-    else:
-        direct = MeanCosine(rng.integers(0, 1 << 16, (n_vertices, m), dtype=np.uint16), lighting)
-    indirect = None
-    if "indirect" in form:
-        coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
-        channels = 1 if "full" in form else 3
-        density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
-        indirect = Indirect(density, upsampling(coarse, lighting), lighting)
-    return LightTransport(
-        lighting=lighting,
-        basis="direction" if form.startswith("bits") else "texel",
-        albedo=rng.random((n_vertices, 3), dtype=np.float32),
-        direct=direct,
-        indirect=indirect,
-        meshes=(MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices))),
-        vertex_keys=rng.integers(0, 1 << 63, n_vertices, dtype=np.uint64),
-        scene_hash="made up",
-        report={"parameters": {"max_depth": 5}},
-    )
 
 
 def slow(transport: LightTransport) -> NDArray[np.float64]:
