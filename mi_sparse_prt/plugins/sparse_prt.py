@@ -12,6 +12,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
 
 
 class SparsePRT(mi.SamplingIntegrator):
@@ -70,6 +71,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),
         }
+        Settings(self._lighting.resolution, **self._settings)  # complains now, not when rendering
         self._edge_length = props.get("edge_length", 0.0) or None
         cache = props.get("cache", "")
         self._cache = Path(cache) if cache else None

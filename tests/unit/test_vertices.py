@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from conftest import T, build, bumpy_ball, diffuse, mesh, still_life
 
+import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
 
 WHITE = diffuse(1, 1, 1)
 FLAT = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": WHITE}
@@ -67,10 +69,12 @@ def test_border_vertices_of_tiny_triangles_stay_in_them():
 
 
 @pytest.mark.parametrize("sides", [3, 4, 6])
-def test_border_vertices_on_a_fold_stay_above_their_surface(sides):
-    """The ends of an open, smooth-shaded prism: its border has corners, and a mean of neighbours lies inside of it.
+def test_border_vertices_on_a_fold_stay_on_their_surface(sides):
+    """The ends of an open, smooth-shaded prism: a mean of its triangles would lie inside of it, in the dark.
 
-    A vertex that sinks into the prism by more than a ray offset sees nothing: rays along the normals must escape.
+    All vertices along an edge of the prism have one normal and, the prism being convex, about one view of the sky.
+    Expected: the end rings have at least three quarters of the middle ring's irradiance (a point on one side of the
+    edge does not see what lies below that side's own horizon). Inside of the prism they would have under a tenth.
     """
     phi = 2 * np.pi * np.arange(sides) / sides
     rings = [np.stack([0.3 * np.cos(phi), 0 * phi + y, 0.3 * np.sin(phi)], axis=-1) for y in (-0.5, 0, 0.5)]
@@ -78,12 +82,14 @@ def test_border_vertices_on_a_fold_stay_above_their_surface(sides):
     right = np.roll(index, -1, axis=1)
     lower = np.stack([index[:-1], index[1:], right[:-1]], axis=-1).reshape(-1, 3)
     upper = np.stack([right[:-1], index[1:], right[1:]], axis=-1).reshape(-1, 3)
-    triangles = np.concatenate([lower, upper])
-    scene = build(float("inf"), prism=mesh("prism", np.concatenate(rings), triangles, WHITE))
-    points = vertex_points(scene)
-    start = points.positions + points.normals * OFFSET * (1 + np.abs(points.positions).max(1, keepdims=True))
-    rays = mi.Ray3f(mi.Point3f(start.T), mi.Vector3f(points.normals.T))
-    assert not scene.normalised.ray_test(rays).numpy().any()
+    prism = mesh("prism", np.concatenate(rings), np.concatenate([lower, upper]), WHITE)
+    scene = build(float("inf"), prism=prism)
+    direct = DirectTransport(scene.normalised, prt.CubemapLighting(8), vertex_points(scene))
+    points, texels = np.repeat(np.arange(3 * sides), 384), np.tile(np.arange(384), 3 * sides)
+    irradiance = direct.elements(points, texels).reshape(3, sides, 384).sum(axis=2)
+    assert (irradiance[1] > 0.5).all()
+    assert (irradiance[[0, 2]] > 0.75 * irradiance[1]).all()
+    assert (irradiance[[0, 2]] < 1.02 * irradiance[1]).all()
 
 
 def test_coincident_vertices_of_meeting_meshes_have_their_own_keys():

@@ -1,0 +1,91 @@
+"""The notebooks run from top to bottom and draw."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+nbformat = pytest.importorskip("nbformat", reason="needs the extra `notebooks`")
+nbclient = pytest.importorskip("nbclient", reason="needs the extra `notebooks`")
+
+NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+
+# Small values for the cell tagged "parameters": the whole notebook in seconds
+SETTINGS = {
+    "RESOLUTION": 4,
+    "EDGE_LENGTH": 1e9,  # meshes as they are
+    "SPP": 1,
+    "INDIRECT_RESOLUTION": 2,
+    "IMAGE_WIDTH": 48,
+    "REFERENCE_ROWS": 4,
+    "REFERENCE_COLUMNS": 4,
+    "REFERENCE_SPP": 4,
+    "IMAGE_SPP": 4,
+}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs_and_draws(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notebook is executed as a reader does, with smaller settings.
+
+    Rationale: a notebook shows the public names in use, and nothing else notices when one of them changes.
+    Expected: no cell raises; every setting that is made smaller exists; at least one picture comes out, and it is
+    not blank; no outputs are stored in the file.
+    Result: the pictures are kept under tests/artefacts.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "stored outputs: clear them"
+    _override(notebook, SETTINGS)
+
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}
+    )
+    client.execute()  # raises CellExecutionError with the cell and its traceback
+
+    pictures = _pictures(notebook)
+    assert pictures, "no figure"
+    folder = Path(__file__).parents[1] / "artefacts"
+    folder.mkdir(exist_ok=True)
+    for k, png in enumerate(pictures):
+        (folder / f"{path.stem}_{k}.png").write_bytes(png)
+        pixels = matplotlib.image.imread(io.BytesIO(png))[..., :3]  # [row, column, rgb]
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100, f"figure {k} is (nearly) blank"
+
+
+def test_a_failing_cell_is_noticed(tmp_path: Path) -> None:
+    """The check itself: a cell that raises fails the run.
+
+    Rationale: an executor that is told to allow errors would pass any notebook.
+    Expected: CellExecutionError.
+    """
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
+    client = nbclient.NotebookClient(
+        notebook, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    )
+    with pytest.raises(nbclient.exceptions.CellExecutionError, match="ZeroDivisionError"):
+        client.execute()
+
+
+def _override(notebook: Any, settings: dict[str, Any]) -> None:
+    """Add a cell with other values behind the one tagged ``parameters``, which must have names for all of them."""
+    tagged = [k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", [])]
+    assert len(tagged) == 1, 'one cell must have the tag "parameters"'
+    names = {
+        line.split("=")[0].strip() for line in notebook.cells[tagged[0]].source.splitlines() if "=" in line
+    }
+    assert set(settings) <= names, f"no such settings: {set(settings) - names}"
+    lines = [f"{name} = {value!r}" for name, value in settings.items()]
+    notebook.cells.insert(tagged[0] + 1, nbformat.v4.new_code_cell("\n".join(lines)))
+
+
+def _pictures(notebook: Any) -> list[bytes]:
+    """All PNGs among the outputs."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return [base64.b64decode(o["data"]["image/png"]) for o in outputs if "image/png" in o.get("data", {})]
