@@ -420,11 +420,21 @@ def _mitsuba_mesh(
     return result
 
 
+def watertight_scene() -> dict[str, Any]:
+    """The beginning of a scene's dict: rays do not slip between triangles.
+
+    Embree's default mode misses hits on edges that triangles share, and light leaks into closed rooms. Its robust mode
+    costs about a quarter more time per ray.
+    """
+    embree = {"embree_use_robust_intersections": True} if mi.variant().startswith("llvm") else {}
+    return {"type": "scene", **embree}
+
+
 def _mitsuba_scene(
     shapes: list[mi.Mesh], views: tuple[Mesh, ...], original: mi.Scene | None = None
 ) -> mi.Scene:
     """A Mitsuba scene of these meshes, in order, with the original's sensors, emitters and integrator."""
-    content: dict[str, Any] = {"type": "scene"}
+    content = watertight_scene()
     content.update({view.name: shape for view, shape in zip(views, shapes, strict=True)})
     if original is not None:
         on_shapes = [s.emitter() for s in original.shapes() if s.is_emitter()]

@@ -46,8 +46,8 @@ def save(transport: LightTransport, path: str | Path) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise PrtError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise PrtError(f"cannot write {path}: it is a folder; give a file name such as {path / 'scene.prt'}")
+    if path.exists() and not path.is_file():
+        raise PrtError(f"cannot write {path}: it is no ordinary file; give a file name such as scene.prt")
     temporary = None
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)

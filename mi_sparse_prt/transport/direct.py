@@ -68,7 +68,8 @@ class DirectTransport:
 
     def rows(self, point_ids: NDArray[np.integer]) -> NDArray[np.uint32] | NDArray[np.uint16]:
         """Trace whole rows and return them in stored form (see ``row_storage``)."""
-        n, ids = len(point_ids), mi.UInt32(point_ids)
+        # one id more than rows: Dr.Jit would compile another kernel for an array of size one
+        n, ids = len(point_ids), mi.UInt32(np.append(point_ids, point_ids[-1:]))
         if self.basis == "direction":
             lane = dr.arange(mi.UInt32, n * self._padded)
             row = lane // self._padded

@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene import Scene, watertight_scene
 
 
 class ReferenceMatrix:
@@ -48,7 +48,7 @@ class ReferenceMatrix:
         shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.normalised.shapes())}
         self._scene = mi.load_dict(
             {
-                "type": "scene",
+                **watertight_scene(),
                 "integrator": {"type": "path", "max_depth": max_depth},
                 "sensor": {"type": "mesh_vertices", "vertices": len(vertices)},
                 "light": light,
@@ -91,6 +91,6 @@ def reference_image(
 ) -> NDArray[np.float32]:
     """Mitsuba's ``path`` image (height, width, 3) of a scene's meshes under one environment emitter, world units."""
     shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.mitsuba.shapes()) if not shape.is_emitter()}
-    lit = mi.load_dict({"type": "scene", "light": background, **shapes})
+    lit = mi.load_dict({**watertight_scene(), "light": background, **shapes})
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
