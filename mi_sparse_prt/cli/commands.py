@@ -311,6 +311,7 @@ def validate(
     rows: Annotated[int, typer.Option(help="Vertices to compare at, drawn from every mesh.")] = 64,
     columns: Annotated[int, typer.Option(help="Texels to compare at: one render each.")] = 256,
     spp: Annotated[int, typer.Option(help="Samples per element of Mitsuba's render.")] = 1024,
+    image_spp: Annotated[int, typer.Option(help="Samples per pixel of the image's reference.")] = 256,
     seed: Annotated[int, typer.Option(help="Of the choice of elements and of the render.")] = 0,
     output: Annotated[
         Path | None,
@@ -340,7 +341,14 @@ def validate(
         loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
         with command.prompt_interrupts():
             result = prt.validate(
-                loaded, transport, n_rows=rows, n_columns=columns, spp=spp, seed=seed, progress=not quiet
+                loaded,
+                transport,
+                n_rows=rows,
+                n_columns=columns,
+                spp=spp,
+                seed=seed,
+                progress=not quiet,
+                image_spp=image_spp,
             )
         command.report = result.report
         if output is not None:

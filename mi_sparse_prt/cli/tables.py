@@ -128,6 +128,7 @@ def validation_table(report: dict[str, Any], title: str) -> Table:
         table.add_section()
         image = report["image"]
         table.add_row("relit image", _share(image["relative_l2"]))
+        table.add_row("of it, interpolation between vertices", _share(image["interpolation"]))
         table.add_row("its reference's noise, not counted above", _share(image["reference_noise"]))
         table.add_row("FLIP, mean", f"{image['flip']:.4f}")
     return table

@@ -94,3 +94,15 @@ def reference_image(
     lit = mi.load_dict({**watertight_scene(), "light": background, **shapes})
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
+
+
+def reference_vertices(
+    scene: Scene, background: mi.Emitter, rays: VertexRays, max_depth: int, spp: int, seed: int
+) -> NDArray[np.float32]:
+    """Mitsuba's ``path`` radiance (n_v, 3) of all vertices under one environment emitter."""
+    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.normalised.shapes())}
+    sensor = {"type": "mesh_vertices", "vertices": len(rays.origins)}
+    lit = mi.load_dict({**watertight_scene(), "light": background, "sensor": sensor, **shapes})
+    lit.sensors()[0].bind(lit, rays)
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+    return lit.sensors()[0].radiance(mi.render(lit, integrator=integrator, spp=spp, seed=seed))

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.matrix import LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
-from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.validation import figures as draw
-from mi_sparse_prt.validation.reference import ReferenceMatrix, reference_image
+from mi_sparse_prt.validation.reference import ReferenceMatrix, reference_image, reference_vertices
 
 GRAZED = 1e-4  # relative difference from which an element of the direct part counts as different
 
@@ -34,7 +34,8 @@ class Validation:
         JSON as it is. ``relative_l2`` (``total``, ``meshes``): error with the reference's noise taken out;
         ``reference_noise``; ``with_noise``: the plain difference; ``row_95th_percentile``, ``row_worst``,
         ``column_worst``; ``estimated_error``: what the matrix said of itself; ``direct_at_hits`` and
-        ``hit_against_vertex``: see ``validate``; ``image``: relative L2, noise and FLIP.
+        ``hit_against_vertex``: see ``validate``; ``image``: relative L2 (noise taken out), FLIP, and in
+        ``interpolation`` the relative L2 of an image whose vertices Mitsuba itself computed.
     figures : dict of matplotlib Figure
         ``image``, ``errors``, ``rows``.
     """
@@ -120,7 +121,7 @@ def validate(
     environment = scene.mitsuba.environment()
     if image and environment is not None and scene.mitsuba.sensors():
         report["image"], figures["image"] = _image_error(
-            scene, transport, environment, image_width, image_spp, seed
+            scene, transport, environment, rays, image_width, image_spp, seed
         )
     return Validation(report, figures)
 
@@ -246,25 +247,42 @@ def _moved_to_hits(
 
 
 def _image_error(
-    scene: Scene, transport: LightTransport, environment: mi.Emitter, width: int, spp: int, seed: int
+    scene: Scene,
+    transport: LightTransport,
+    environment: mi.Emitter,
+    rays: VertexRays,
+    width: int,
+    spp: int,
+    seed: int,
 ) -> tuple[dict[str, float], Figure]:
-    """A relit image against ``path`` under the same cubemap, in two halves."""
+    """A relit image against ``path`` under the same cubemap, in two halves, and what interpolation alone costs."""
     lighting = transport.lighting.project(environment)
     background = background_emitter(lighting, transport)
     max_depth = transport.report["parameters"]["max_depth"]
     sensor = scene.mitsuba.sensors()[0]
+    seeds = (2 * seed + 10, 2 * seed + 11)
     with _Resized(sensor, width):
         ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
-        halves = [
-            reference_image(scene, background, sensor, max_depth, spp // 2, seed=2 * seed + 10 + k)
-            for k in (0, 1)
-        ]
+        halves = [reference_image(scene, background, sensor, max_depth, spp // 2, seed=k) for k in seeds]
+        exact = []  # images of Mitsuba's own vertices, interpolated as ours are
+        for k in seeds:
+            radiance = reference_vertices(scene, background, rays, max_depth, max(1, spp // 8), seed=k)
+            irradiance = np.divide(
+                radiance, scene.albedo, out=np.zeros_like(radiance), where=scene.albedo > 0
+            )
+            relit = RelitIntegrator(RelitScene(scene, irradiance, background))
+            image = mi.render(
+                scene.mitsuba, sensor=sensor, integrator=relit, spp=max(16, spp // 8), seed=seed + 20
+            )
+            exact.append(np.array(image)[..., :3])
     reference = (halves[0] + halves[1]) / 2
-    square = float(((ours - halves[0]) * (ours - halves[1])).sum(dtype=np.float64))
-    norm = float((halves[0] * halves[1]).sum(dtype=np.float64))
+    norm = (halves[0] * halves[1]).sum(dtype=np.float64)
+    square = ((ours - halves[0]) * (ours - halves[1])).sum(dtype=np.float64)
+    interpolation = ((exact[0] - halves[0]) * (exact[1] - halves[1])).sum(dtype=np.float64)
     flip_map, flip_mean, _ = flip_evaluator.evaluate(reference, ours, "HDR")
     report = {
-        "relative_l2": float(_ratio(np.array(square), np.array(norm))),
+        "relative_l2": float(_ratio(square, norm)),
+        "interpolation": float(_ratio(interpolation, norm)),
         "reference_noise": float(np.linalg.norm(halves[0] - halves[1]) / 2 / np.sqrt(norm)),
         "flip": float(flip_mean),
     }

@@ -11,20 +11,34 @@ from mi_sparse_prt.relighting.image import RelitScene, render
 LIGHTING = prt.CubemapLighting(2)
 
 
-def camera(size: int = 32, origin: tuple = (0, 1, 0), target: tuple = (0, 0, 0), up: tuple = (0, 0, -1)) -> dict:
+def camera(
+    size: int = 32, origin: tuple = (0, 1, 0), target: tuple = (0, 0, 0), up: tuple = (0, 0, -1)
+) -> dict:
     """Looks down on the square [-1, 1]^2 of the ground, +x to the right, -z upwards, one pixel of slack."""
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    film = {
+        "type": "hdrfilm",
+        "width": size,
+        "height": size,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+    }
     view = T().look_at(origin=list(origin), target=list(target), up=list(up))
     if origin != (0, 1, 0):
         return {"type": "perspective", "fov": 45, "to_world": view, "film": film}
-    return {"type": "orthographic", "to_world": view @ T().scale([-1, 1, 1]) @ T().scale([-1, 1, 1]), "film": film}
+    return {
+        "type": "orthographic",
+        "to_world": view @ T().scale([-1, 1, 1]) @ T().scale([-1, 1, 1]),
+        "film": film,
+    }
 
 
 def ground(bsdf: dict, **parameters: object) -> dict:
     return {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": bsdf, **parameters}
 
 
-def looked_at(scene: prt.Scene, irradiance: np.ndarray, x: np.ndarray, z: np.ndarray, up: bool = True) -> np.ndarray:
+def looked_at(
+    scene: prt.Scene, irradiance: np.ndarray, x: np.ndarray, z: np.ndarray, up: bool = True
+) -> np.ndarray:
     """Radiance (m, 3) at ground points, seen straight from above (or from below)."""
     relit = RelitScene(scene, irradiance.astype(np.float32), None)
     y, d = (1.0, -1.0) if up else (-1.0, 1.0)
@@ -58,7 +72,9 @@ def test_each_triangle_has_the_values_of_its_own_corners(grey_scene):
     si = grey_scene.mitsuba.ray_intersect(ray)
     front = valid & (mi.Frame3f.cos_theta(si.wi).numpy() > 0)
     checked = 0
-    for mesh, shape, albedo in zip(grey_scene.meshes, grey_scene.mitsuba.shapes(), (0.5, 0.6, 0.7), strict=True):
+    for mesh, shape, albedo in zip(
+        grey_scene.meshes, grey_scene.mitsuba.shapes(), (0.5, 0.6, 0.7), strict=True
+    ):
         hit = front & (si.shape == mi.ShapePtr(shape)).numpy()
         corners = values[mesh.triangles[si.prim_index.numpy()[hit]] + mesh.vertices.start]
         inner = seen.T[hit] / albedo

@@ -24,7 +24,9 @@ def slow(transport: LightTransport) -> NDArray[np.float64]:
             solid_angle = float(lighting.solid_angles[j])
             if transport.basis == "direction":
                 visible = (int(transport.direct.bits[i, j // 32]) >> (j % 32)) & 1
-                cosine = float(transport.direct.normals[i].astype(float) @ lighting.directions[j].astype(float))
+                cosine = float(
+                    transport.direct.normals[i].astype(float) @ lighting.directions[j].astype(float)
+                )
                 white = np.full(3, visible * max(0.0, cosine) * solid_angle / np.pi)
             else:
                 white = np.full(3, transport.direct.fixed[i, j] / 65535 * solid_angle / np.pi)
@@ -221,7 +223,9 @@ def test_a_matrix_of_other_vertices_of_the_scene_is_refused():
 def test_upsampling_may_have_any_sparsity():
     """Columns and relight read the interpolation matrix in two ways: by rows and transposed."""
     transport = made_up("bits and coarse indirect")
-    random = scipy.sparse.random_array((96, 24), density=0.3, rng=np.random.default_rng(3), dtype=np.float32).tocsr()
+    random = scipy.sparse.random_array(
+        (96, 24), density=0.3, rng=np.random.default_rng(3), dtype=np.float32
+    ).tocsr()
     transport = replace(transport, indirect=replace(transport.indirect, upsampling=random))
     full = slow(transport)
     assert close(transport.columns(np.arange(96)), full)

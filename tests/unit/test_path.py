@@ -39,7 +39,9 @@ def test_same_seed_same_estimate_other_seed_another(grey_scene):
     assert np.array_equal(first, solver(grey_scene, seed=3).rows(ids).mean)
     other = solver(grey_scene, seed=4).rows(ids).mean
     assert (first != other).mean() > 0.3
-    by_argument = solver(grey_scene, seed=3).elements(np.repeat(ids, 24), np.tile(np.arange(24), len(ids)), seed=4)
+    by_argument = solver(grey_scene, seed=3).elements(
+        np.repeat(ids, 24), np.tile(np.arange(24), len(ids)), seed=4
+    )
     assert np.array_equal(by_argument.mean.ravel(), other.ravel())
 
 
@@ -54,7 +56,9 @@ def test_reported_variance_is_that_of_the_mean(coloured_scene, basis):
     n = coloured_scene.n_vertices
     ids = np.repeat(np.arange(n), 24), np.tile(np.arange(24), n)
     runs = [path.elements(*ids, seed=k) for k in range(32)]
-    means, variances = (np.array([getattr(r, name) for r in runs], np.float64) for name in ("mean", "variance"))
+    means, variances = (
+        np.array([getattr(r, name) for r in runs], np.float64) for name in ("mean", "variance")
+    )
     ratio = means.var(axis=0, ddof=1).sum(axis=0) / variances.mean(axis=0).sum(axis=0)  # per channel
     assert (np.abs(ratio - 1) < 0.03).all()
 

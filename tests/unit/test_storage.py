@@ -237,7 +237,9 @@ def failing_write(error: BaseException):
     return write
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), ValueError("bug"), SystemExit(1)], ids=repr)
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), MemoryError(), ValueError("bug"), SystemExit(1)], ids=repr
+)
 def test_an_interrupted_save_leaves_nothing(tmp_path, monkeypatch, error):
     monkeypatch.setattr(storage, "_write", failing_write(error))
     with pytest.raises(type(error)):
