@@ -58,6 +58,20 @@ class IndirectPlan:
         return {**asdict(self), "paths_per_vertex": self.paths, "predicted_error": self.error}
 
 
+def indirect_solver(scene: Scene, settings: Settings) -> PathTransport:
+    """The solver that settings ask for, at the scene's vertices."""
+    return PathTransport(
+        scene.normalised,
+        settings.coarse,
+        vertex_points(scene),
+        settings.indirect_basis,
+        settings.max_depth,
+        settings.spp,
+        1 if scene.grey else 3,
+        settings.seed,
+    )
+
+
 def plan_indirect(scene: Scene, lighting: CubemapLighting, settings: Settings) -> list[IndirectPlan]:
     """Find the cheapest resolution and sample count of the indirect light that meet a target error.
 
@@ -101,16 +115,7 @@ def _bias_and_noise(
     """Relative L2 of what samples do not remove, and of the noise of one sample per element."""
     points, shape, basis = vertex_points(scene), held.texels.shape, settings.basis
     flat = np.repeat(held.vertices, shape[1]), held.texels.ravel()
-    solver = PathTransport(
-        scene.normalised,
-        settings.coarse,
-        points,
-        settings.indirect_basis,
-        settings.max_depth,
-        PILOT_SPP,
-        1 if scene.grey else 3,
-        settings.seed,
-    )
+    solver = indirect_solver(scene, replace(settings, spp=PILOT_SPP))
     same = settings.coarse.resolution == lighting.resolution
     mean, variance = _at_elements(solver, held) if same else _interpolated(solver, lighting, held)
     direct = DirectTransport(scene.normalised, lighting, points, basis, settings.strata, settings.seed)

@@ -22,7 +22,7 @@ from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.planner import IndirectPlan, plan_indirect
+from mi_sparse_prt.planner import IndirectPlan, indirect_solver, plan_indirect
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -99,7 +99,7 @@ def precompute(
     clock, points = Stopwatch(), vertex_points(scene)
     settings, plans = _planned(scene, lighting, settings, clock)
     direct = DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
-    indirect, skipped = _indirect_solver(scene, settings, points, clock)
+    indirect, skipped = _indirect_if_any(scene, settings, clock)
     forecast = _forecast(direct, indirect, clock, progress)
     checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
     transport = LightTransport(
@@ -157,22 +157,13 @@ def _no_indirect(scene: Scene, settings: Settings) -> str | None:
     return None
 
 
-def _indirect_solver(
-    scene: Scene, settings: Settings, points: Points, clock: Stopwatch
+def _indirect_if_any(
+    scene: Scene, settings: Settings, clock: Stopwatch
 ) -> tuple[PathTransport | None, list[str]]:
     """The solver for indirect light if any can arrive, and what is skipped."""
     reason = _no_indirect(scene, settings)
     if reason is None:
-        solver = PathTransport(
-            scene.normalised,
-            settings.coarse,
-            points,
-            settings.indirect_basis,
-            settings.max_depth,
-            settings.spp,
-            1 if scene.grey else 3,
-            settings.seed,
-        )
+        solver = indirect_solver(scene, settings)
         with clock.phase("pilot"):
             surfaces_meet = solver.any_hit(_PILOT_RAYS)
         if surfaces_meet:

@@ -36,14 +36,14 @@ class Settings:
             raise PrtError(f"unknown method {self.method!r}; choose one of: {', '.join(METHODS)}")
         if self.basis not in BASES:
             raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")
+        for name, least in (("spp", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):
+            value = getattr(self, name)
+            if value != int(value) or value < least:
+                raise PrtError(f"{name} is {value}; it must be a whole number of at least {least}")
         if self.max_depth < 2 and self.max_depth != -1:
             raise PrtError(f"max_depth is {self.max_depth}; 2 is direct light only, -1 is no limit")
         if self.target_error is not None and not self.target_error > 0:
             raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
-        for name in ("spp", "strata"):
-            value = getattr(self, name)
-            if value < 1 or value != int(value):
-                raise PrtError(f"{name} is {value}; it must be a whole number of at least 1")
         if self.coarse.resolution > self.resolution:
             raise PrtError(
                 f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
