@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 1
@@ -47,7 +48,7 @@ def save(transport: LightTransport, path: str | Path) -> None:
     if not path.parent.is_dir():
         raise PrtError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     if path.exists() and not path.is_file():
-        raise PrtError(f"cannot write {path}: it is no ordinary file; give a file name such as scene.prt")
+        raise PrtError(f"cannot write {path}: it is a folder or a device; give a file name such as scene.prt")
     temporary = None
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
@@ -158,6 +159,7 @@ def _read(array: Any) -> NDArray[Any]:
 
 def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
     lighting = CubemapLighting(attributes["resolution"])
+    _check_shapes(arrays, lighting)
     direct: Visibility | MeanCosine
     if attributes["basis"] == "direction":
         direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
@@ -182,3 +184,20 @@ def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Li
         scene_hash=attributes["scene_hash"],
         report=attributes["report"],
     )
+
+
+def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> None:
+    """All arrays are of the same vertices and of the file's lighting."""
+    n, m = len(arrays["albedo"]), lighting.n_directions
+    expected = {
+        "albedo": (n, 3),
+        "vertex_keys": (n,),
+        "normals": (n, 3),
+        "visibility": (n, -(-m // BITS)),
+        "mean_cosine": (n, m),
+        "indirect": (n, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
+        "upsampling_indptr": (m + 1,),
+    }
+    for name, shape in expected.items():
+        if name in arrays and arrays[name].shape != shape:
+            raise ValueError(f"array {name} has shape {arrays[name].shape} instead of {shape}")

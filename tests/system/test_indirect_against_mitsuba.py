@@ -40,9 +40,7 @@ class Comparison:
 
     def scaled(self, factor: float) -> "Comparison":
         """The same with our side multiplied: a bias that a test must find."""
-        return Comparison(
-            factor * self.ours, self.theirs, self.ours_error, self.theirs_error, self.rounding
-        )
+        return Comparison(factor * self.ours, self.theirs, self.ours_error, self.theirs_error, self.rounding)
 
     @property
     def relative_error(self) -> float:
@@ -75,32 +73,33 @@ def compare(
     max_depth: int,
     spp: int,
     reference: tuple[int, int],
-    channel: int = 1,
-) -> Comparison:
-    """Both sides of all columns of some rows; ``reference``: independent renders and the samples of each."""
-    lighting, rays = prt.CubemapLighting(n), vertex_rays(scene.normalised)
-    m = lighting.n_directions
-    flat = np.repeat(rows, m), np.tile(np.arange(m), len(rows))
-    path = PathTransport(
-        scene.normalised,
-        lighting,
-        sensor_points(scene, rays),
-        basis,
-        max_depth,
-        spp,
-        1 if scene.grey else 3,
-        seed=1,
-    )
-    estimate = path.elements(*flat)
-    own = min(channel, path.channels - 1)
-    scale = (scene.albedo[flat[0], channel] * lighting.solid_angles[flat[1]]).astype(np.float64)
-    ours = (scale * estimate.mean[:, own]).reshape(len(rows), m)
-    ours_error = (scale * np.sqrt(estimate.variance[:, own])).reshape(len(rows), m)
+) -> list[Comparison]:
+    """Both sides of all columns of some rows, one item per channel (one in all if the scene is grey).
 
+    ``reference``: number of independent renders, and samples of each.
+    """
+    lighting, rays = prt.CubemapLighting(n), vertex_rays(scene.normalised)
+    shape = (len(rows), lighting.n_directions)
+    vertex, texel = np.repeat(rows, shape[1]), np.tile(np.arange(shape[1]), shape[0])
+    points, channels = sensor_points(scene, rays), 1 if scene.grey else 3
+    path = PathTransport(scene.normalised, lighting, points, basis, max_depth, spp, channels, seed=1)
+    estimate = path.elements(vertex, texel)
     direct, indirect = mitsuba_columns(scene, rays.chosen(rows), lighting, basis, max_depth, *reference)
-    theirs = indirect[..., channel]  # [render, row, column]
-    theirs_error = theirs.std(axis=0, ddof=1) / np.sqrt(len(theirs))
-    return Comparison(ours, theirs.mean(axis=0), ours_error, theirs_error, 1e-6 * direct[..., channel])
+    result = []
+    for c in range(channels):
+        scale = (scene.albedo[vertex, c] * lighting.solid_angles[texel]).astype(np.float64).reshape(shape)
+        error = np.sqrt(estimate.variance[:, c].reshape(shape))
+        theirs = indirect[..., c]  # [render, row, column]
+        result.append(
+            Comparison(
+                ours=scale * estimate.mean[:, c].reshape(shape),
+                theirs=theirs.mean(axis=0),
+                ours_error=scale * error,
+                theirs_error=theirs.std(axis=0, ddof=1) / np.sqrt(len(theirs)),
+                rounding=1e-6 * direct[..., c],
+            )
+        )
+    return result
 
 
 def mitsuba_columns(scene, rays, lighting, basis, max_depth, renders, spp) -> tuple[np.ndarray, np.ndarray]:
@@ -143,10 +142,14 @@ def draw(result: Comparison) -> Figure:
     figure = Figure(figsize=(11, 4))
     left, right = figure.subplots(1, 2)
     x = np.linspace(-4, 4, 200)
-    left.hist(result.z, 40, (-4, 4), density=True, color="0.7", label=f"{len(result.z)} elements")
-    left.hist(result.row_z, 20, (-4, 4), density=True, histtype="step", color="C1", label=f"{len(result.row_z)} rows")
+    left.hist(result.z, 40, range=(-4, 4), density=True, color="0.7", label=f"{len(result.z)} elements")
+    left.hist(
+        result.row_z, 20, range=(-4, 4), density=True, histtype="step", label=f"{len(result.row_z)} rows"
+    )
     left.plot(x, stats.norm.pdf(x), "k", lw=1)
-    left.set(xlabel="z", title=f"total z {result.total_z:+.2f}, its standard error {result.relative_error:.2%}")
+    left.set(
+        xlabel="z", title=f"total z {result.total_z:+.2f}, its standard error {result.relative_error:.2%}"
+    )
     left.legend()
     right.plot(result.theirs.ravel(), result.ours.ravel(), ".", ms=2)
     top = max(result.theirs.max(), 1e-9)
@@ -170,14 +173,15 @@ def assert_unbiased(result: Comparison) -> None:
 def assert_normal(result: Comparison) -> None:
     """z-scores of elements and of rows are distributed as N(0, 1), and would not be with a bias of 2%.
 
-    Elements: the shares beyond 2 and 3 (4.55% and 0.27%; sums of a few hundred paths have slightly heavier tails, so
-    up to 6.5% and 0.8%) and their spread. Rows: a Kolmogorov-Smirnov test at p = 0.1%.
+    Elements: the shares beyond 2 and 3 (4.55% and 0.27%, each with a sampling error of about 1% and 0.25% for 400
+    elements, and slightly heavier tails of sums of a few hundred paths) and their spread. Rows: a Kolmogorov-Smirnov
+    test at p = 0.1%.
     """
     z = np.abs(result.z)
-    assert len(z) > 500
-    assert 0.03 < (z > 2).mean() < 0.065
-    assert (z > 3).mean() < 0.008
-    assert 0.94 < result.z.std() < 1.08
+    assert len(z) > 250
+    assert 0.02 < (z > 2).mean() < 0.08
+    assert (z > 3).mean() < 0.012
+    assert 0.9 < result.z.std() < 1.12
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
     for factor in (1.02, 0.98):
         assert stats.kstest(result.scaled(factor).row_z, "norm").pvalue < 1e-3
@@ -187,16 +191,16 @@ def assert_normal(result: Comparison) -> None:
 def test_grey_scene(grey_scene, artefact, max_depth):
     """Rationale: one interreflection and three, in the direction basis, one channel for all.
 
-    A ball and a box over a ground; every second vertex, 24 columns at n = 2; 1024 paths of ours against 8 x 256 of
+    A ball and a box over a ground; every fourth vertex, 24 columns at n = 2; 1024 paths of ours against 8 x 256 of
     Mitsuba's `path`, whose directional emitter is found by shadow rays alone, as ours.
 
     Expected: the mean within 3 standard errors; z-scores of elements and rows standard normal; a 2% bias fails both.
     The two estimators are the same, so their variances per path agree within 10%.
 
-    Result: standard errors of the total 0.2%; total z within 1; see the figures.
+    Result: RESULT_GREY
     """
-    rows = np.arange(0, grey_scene.n_vertices, 2)
-    result = compare(grey_scene, rows, 2, "direction", max_depth, 1024, (8, 256))
+    rows = np.arange(0, grey_scene.n_vertices, 4)
+    (result,) = compare(grey_scene, rows, 2, "direction", max_depth, 1024, (8, 256))
     artefact(draw(result))
     assert_unbiased(result)
     assert_normal(result)
@@ -204,19 +208,23 @@ def test_grey_scene(grey_scene, artefact, max_depth):
     assert 0.9 < variances[0] / variances[1] < 1.1
 
 
-@pytest.mark.parametrize("channel", [0, 2], ids=["red", "blue"])
-def test_coloured_scene(coloured_scene, artefact, channel):
+def test_coloured_scene(coloured_scene, artefact):
     """Rationale: colour comes from the surfaces that paths meet, channel by channel.
 
     The same scene with an orange ground, a blue ball and a green box; max_depth 5.
 
-    Expected and result: as in the grey scene, for the first and the last channel.
+    Expected: as in the grey scene, in all three channels, which differ from each other by far more than their errors.
+
+    Result: RESULT_COLOURED
     """
-    rows = np.arange(0, coloured_scene.n_vertices, 2)
-    result = compare(coloured_scene, rows, 2, "direction", 5, 1024, (8, 256), channel)
-    artefact(draw(result))
-    assert_unbiased(result)
-    assert_normal(result)
+    rows = np.arange(0, coloured_scene.n_vertices, 4)
+    channels = compare(coloured_scene, rows, 2, "direction", 5, 1024, (8, 256))
+    for result, name in zip(channels, ("red", "green", "blue"), strict=True):
+        artefact(draw(result), f"_{name}")
+        assert_unbiased(result)
+        assert_normal(result)
+    totals = [result.ours.sum() for result in channels]
+    assert max(totals) > 1.2 * min(totals)
 
 
 def test_texel_basis(coloured_scene, artefact):
@@ -224,10 +232,12 @@ def test_texel_basis(coloured_scene, artefact):
 
     The coloured scene, max_depth 4, n = 2. Mitsuba adds paths that hit the light by chance (MIS), so variances differ.
 
-    Expected and result: as in the direction basis.
+    Expected: as in the direction basis.
+
+    Result: RESULT_TEXEL
     """
-    rows = np.arange(0, coloured_scene.n_vertices, 3)
-    result = compare(coloured_scene, rows, 2, "texel", 4, 2048, (8, 256))
+    rows = np.arange(0, coloured_scene.n_vertices, 6)
+    result = compare(coloured_scene, rows, 2, "texel", 4, 2048, (6, 512))[1]
     artefact(draw(result))
     assert_unbiased(result)
     assert_normal(result)
@@ -235,6 +245,7 @@ def test_texel_basis(coloured_scene, artefact):
 
 def room() -> prt.Scene:
     """A bright room, open in a third of one wall, with a ball in it: light is reflected many times."""
+
     def wall(place: mi.ScalarTransform4f) -> dict:
         return {"type": "rectangle", "to_world": place, "bsdf": diffuse(0.9, 0.9, 0.9)}
 
@@ -254,7 +265,7 @@ def room() -> prt.Scene:
 def test_without_a_depth_limit(artefact):
     """Rationale: max_depth -1 ends paths by Russian roulette alone, in a room of albedo 0.9 that is nearly closed.
 
-    Every third vertex, 24 columns at n = 2, against Mitsuba's `path` without a limit. Depth 5 must be clearly darker,
+    Every sixth vertex, 24 columns at n = 2, against Mitsuba's `path` without a limit. Depth 5 must be clearly darker,
     or the test would say nothing about long paths.
 
     Expected: the mean within 3 standard errors and a 2% bias caught; rows standard normal.
@@ -262,13 +273,17 @@ def test_without_a_depth_limit(artefact):
     Result: standard error 0.4%; max_depth 5 has two thirds of the light.
     """
     scene = room()
-    rows = np.arange(0, scene.n_vertices, 3)
-    result = compare(scene, rows, 2, "direction", -1, 4096, (4, 1024))
+    rows = np.arange(0, scene.n_vertices, 6)
+    (result,) = compare(scene, rows, 2, "direction", -1, 2048, (4, 1024))
     artefact(draw(result))
     assert_unbiased(result)
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
-    limited = compare(scene, rows[::4], 2, "direction", 5, 512, (2, 16)).ours.sum()
-    assert limited < 0.8 * result.ours[::4].sum()
+    solver = PathTransport(
+        scene.normalised, prt.CubemapLighting(2), sensor_points(scene), max_depth=5, spp=256
+    )
+    mean = solver.rows(rows).mean[..., 1] * solver.lighting.solid_angles * scene.albedo[rows, 1, None]
+    print(f"max_depth 5 has {mean.sum() / result.ours.sum():.1%} of the light")
+    assert mean.sum() < 0.8 * result.ours.sum()
 
 
 def glossy_scene() -> prt.Scene:
@@ -282,8 +297,12 @@ def glossy_scene() -> prt.Scene:
         ground=shapes["ground"],
         glass=mesh("glass", vertices + [-0.4, 0.7, 0], triangles, {"type": "dielectric"}),
         box={**shapes["box"], "bsdf": mirror},
-        metal=mesh("metal", 0.4 * vertices + [0.3, 0.3, 0.9], triangles, {"type": "roughconductor", "alpha": 0.3}),
-        milk=mesh("milk", 0.4 * vertices + [-0.7, 0.3, 1], triangles, {"type": "roughdielectric", "alpha": 0.2}),
+        metal=mesh(
+            "metal", 0.4 * vertices + [0.3, 0.3, 0.9], triangles, {"type": "roughconductor", "alpha": 0.3}
+        ),
+        milk=mesh(
+            "milk", 0.4 * vertices + [-0.7, 0.3, 1], triangles, {"type": "roughdielectric", "alpha": 0.2}
+        ),
         sheet={"type": "rectangle", "to_world": T().translate([0.3, 0.9, -0.9]).scale(0.4), "bsdf": sheet},
     )
 
@@ -302,14 +321,15 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
     """
     scene = glossy_scene()
     rows = np.arange(0, scene.meshes[0].vertices.stop, 3)
-    result = compare(scene, rows, 1, "texel", 5, 1 << 15, (4, 1 << 13))
-    artefact(draw(result))
-    assert_unbiased(result)
-    assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
+    channels = compare(scene, rows, 1, "texel", 5, 1 << 14, (4, 1 << 12))
+    for result, name in zip(channels, ("red", "green", "blue"), strict=True):
+        artefact(draw(result), f"_{name}")
+        assert_unbiased(result)
+        assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
 
     monkeypatch.setattr(path_module, "_has_mirrors", lambda _: False)
     lighting = prt.CubemapLighting(1)
     blind = PathTransport(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
-    found = (blind.mean[..., 1] * scene.albedo[rows, 1, None] * lighting.solid_angles).sum()
+    found = (blind.mean[..., 2] * scene.albedo[rows, 2, None] * lighting.solid_angles).sum()
     print(f"without mirror paths {found / result.theirs.sum():.1%} of the indirect light")
     assert found < 0.9 * result.theirs.sum()
