@@ -173,15 +173,15 @@ def assert_unbiased(result: Comparison) -> None:
 def assert_normal(result: Comparison) -> None:
     """z-scores of elements and of rows are distributed as N(0, 1), and would not be with a bias of 2%.
 
-    Elements: the shares beyond 2 and 3 (4.55% and 0.27%, each with a sampling error of about 1% and 0.25% for 400
-    elements, and slightly heavier tails of sums of a few hundred paths) and their spread. Rows: a Kolmogorov-Smirnov
-    test at p = 0.1%.
+    Elements: the shares beyond 2 and 3 (4.55% and 0.27%, known to about 1% and 0.25% from 400 elements; Mitsuba's
+    standard errors have 5 to 7 degrees of freedom, which makes the tails somewhat heavier) and their spread. Rows: a
+    Kolmogorov-Smirnov test at p = 0.1%.
     """
     z = np.abs(result.z)
     assert len(z) > 250
-    assert 0.02 < (z > 2).mean() < 0.08
-    assert (z > 3).mean() < 0.012
-    assert 0.9 < result.z.std() < 1.12
+    assert 0.02 < (z > 2).mean() < 0.09
+    assert (z > 3).mean() < 0.015
+    assert 0.9 < result.z.std() < 1.15
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
     for factor in (1.02, 0.98):
         assert stats.kstest(result.scaled(factor).row_z, "norm").pvalue < 1e-3
@@ -197,7 +197,7 @@ def test_grey_scene(grey_scene, artefact, max_depth):
     Expected: the mean within 3 standard errors; z-scores of elements and rows standard normal; a 2% bias fails both.
     The two estimators are the same, so their variances per path agree within 10%.
 
-    Result: RESULT_GREY
+    Result: total z +0.2 and +0.8 with standard errors of 0.3% of the total; 6.0% and 4.9% of elements beyond 2.
     """
     rows = np.arange(0, grey_scene.n_vertices, 4)
     (result,) = compare(grey_scene, rows, 2, "direction", max_depth, 1024, (8, 256))
@@ -215,7 +215,7 @@ def test_coloured_scene(coloured_scene, artefact):
 
     Expected: as in the grey scene, in all three channels, which differ from each other by far more than their errors.
 
-    Result: RESULT_COLOURED
+    Result: total z +0.2, +0.7, +0.9 with standard errors of 0.3%; 6% of elements beyond 2, 0.6% beyond 3.
     """
     rows = np.arange(0, coloured_scene.n_vertices, 4)
     channels = compare(coloured_scene, rows, 2, "direction", 5, 1024, (8, 256))
@@ -234,9 +234,9 @@ def test_texel_basis(coloured_scene, artefact):
 
     Expected: as in the direction basis.
 
-    Result: RESULT_TEXEL
+    Result: total z -0.4 with a standard error of 0.3%; 8.6% of elements beyond 2, 0.3% beyond 3.
     """
-    rows = np.arange(0, coloured_scene.n_vertices, 6)
+    rows = np.arange(0, coloured_scene.n_vertices, 4)
     result = compare(coloured_scene, rows, 2, "texel", 4, 2048, (6, 512))[1]
     artefact(draw(result))
     assert_unbiased(result)
@@ -270,11 +270,11 @@ def test_without_a_depth_limit(artefact):
 
     Expected: the mean within 3 standard errors and a 2% bias caught; rows standard normal.
 
-    Result: standard error 0.4%; max_depth 5 has two thirds of the light.
+    Result: total z +0.9 with a standard error of 0.4%; max_depth 5 has 39% of the light.
     """
     scene = room()
     rows = np.arange(0, scene.n_vertices, 6)
-    (result,) = compare(scene, rows, 2, "direction", -1, 2048, (4, 1024))
+    (result,) = compare(scene, rows, 2, "direction", -1, 2048, (4, 512))
     artefact(draw(result))
     assert_unbiased(result)
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
@@ -309,15 +309,15 @@ def glossy_scene() -> prt.Scene:
 
 @pytest.mark.filterwarnings("ignore:.*is not diffuse")
 def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
-    """Rationale: an indirect path may meet any BSDF, and light that a mirror or glass focuses is found by no shadow ray.
+    """Rationale: paths may meet any BSDF, and light that a mirror or glass focuses is found by no shadow ray.
 
     A diffuse ground among a glass ball, a mirror box, rough metal, milky glass and a mask of half opacity; every third
     ground vertex; texel basis at n = 1 (large lights, so that Mitsuba finds them through glass as well), max_depth 5.
 
     Expected: the mean of each channel within 3 standard errors and a 2% bias caught; rows standard normal. Without the
-    paths that see the light in mirrors and through glass, a good part is missing (checked: the test can fail there).
+    paths that see the light in mirrors and through glass, most of it is missing (checked: the test can fail there).
 
-    Result: standard error 0.4%; those paths bring more than a third of the indirect light.
+    Result: total z -0.2 in all channels with a standard error of 0.5%; without those paths 19% of the light is left.
     """
     scene = glossy_scene()
     rows = np.arange(0, scene.meshes[0].vertices.stop, 3)
@@ -332,4 +332,4 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
     blind = PathTransport(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
     found = (blind.mean[..., 2] * scene.albedo[rows, 2, None] * lighting.solid_angles).sum()
     print(f"without mirror paths {found / result.theirs.sum():.1%} of the indirect light")
-    assert found < 0.9 * result.theirs.sum()
+    assert found < 0.5 * result.theirs.sum()
