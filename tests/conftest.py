@@ -82,7 +82,8 @@ def still_life(albedos: tuple = GREY, place: mi.ScalarTransform4f | None = None)
         "ball": mesh("ball", vertices, triangles, ball),
         "box": {
             "type": "cube",
-            "to_world": place @ T().translate([0.65, 0.45, 0.2]).rotate([0.2, 1, 0], 30).scale(0.3),
+            "to_world": place
+            @ T().translate([0.65, 0.45, 0.2]).rotate([0, 1, 0], 30).rotate([1, 0, 0], 11).scale(0.3),
             "bsdf": box,
         },
     }
