@@ -48,7 +48,7 @@ def surface(rings: list[np.ndarray], inwards: bool) -> tuple[np.ndarray, np.ndar
 def test_a_convex_object_alone(kind, artefact):
     """Rationale: under constant light a convex object has B = albedo everywhere: it sees the whole hemisphere.
 
-    Sphere, cube and an ellipsoid of three axes with a coloured albedo; texel basis at n = 16, 4 x 4 strata, max_depth 5.
+    Sphere, cube and an ellipsoid of three axes, coloured albedo; texel basis at n = 16, 4 x 4 strata, max_depth 5.
 
     Expected: B = albedo at every vertex within 1e-3, and no indirect light at all. A missing border vertex, a texel
     counted twice (dω / 4π = 0.07% each) or a wrong solid angle fails.
@@ -103,6 +103,7 @@ BOXES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:.*faces point inwards")
 @pytest.mark.parametrize("kind", BOXES)
 @pytest.mark.parametrize("basis", ["direction", "texel"])
 def test_a_closed_box_is_dark(kind, basis, artefact):
@@ -119,29 +120,32 @@ def test_a_closed_box_is_dark(kind, basis, artefact):
     """
     vertices, triangles = bumpy_ball()
     scene = build(0.5, ball=mesh("ball", vertices, triangles, GREY), **BOXES[kind])
-    transport = prt.precompute(scene, prt.CubemapLighting(8), basis=basis, spp=4, progress=False)
-    direct = transport.direct.rows(np.arange(scene.n_vertices))
+    lighting, points = prt.CubemapLighting(8), vertex_points(scene)
+    vertex, texel = np.repeat(np.arange(len(points)), 384), np.tile(np.arange(384), len(points))
+    direct = DirectTransport(scene.normalised, lighting, points, basis).elements(vertex, texel)
+    path = PathTransport(scene.normalised, lighting, points, basis, max_depth=5, spp=4, channels=1)
+    indirect = path.elements(vertex, texel).mean[:, 0]
     figure = Figure(figsize=(6, 3))
     axes = figure.subplots()
-    axes.plot(direct.sum(axis=(1, 2)), label="direct")
-    axes.plot(transport.indirect.density.sum(axis=(1, 2)), label="indirect")
+    for part, name in ((direct, "direct"), (indirect, "indirect")):
+        axes.plot(part.reshape(len(points), 384).sum(axis=1), label=name)
     axes.set(xlabel="vertex", ylabel="light that leaks in")
     axes.legend()
     artefact(figure)
-    print(f"{np.count_nonzero(direct)} of {direct.size} elements leak")
-    if kind == "six walls" and basis == "direction":
-        assert np.count_nonzero(direct) < 3e-4 * direct.size
-        assert np.count_nonzero(transport.indirect.density) < 3e-4 * transport.indirect.density.size
-    else:
-        assert np.count_nonzero(direct) == 0
-        assert np.count_nonzero(transport.indirect.density) == 0
+    print(f"{np.count_nonzero(direct)} and {np.count_nonzero(indirect)} of {direct.size} elements leak")
+    allowed = 3e-4 * direct.size if kind == "six walls" and basis == "direction" else 0
+    assert np.count_nonzero(direct) <= allowed
+    assert np.count_nonzero(indirect) <= allowed
 
 
 # ------------------------------------------------------------------------------------ form factors
 
 
-def irradiance_at_origin(scene: prt.Scene, seeds: int = 64) -> tuple[float, float]:
-    """Direct irradiance / pi under constant light at the floor's vertex at the origin, and its standard error."""
+def irradiance_at_origin(scene: prt.Scene, seeds: int = 64) -> tuple[float, float, float]:
+    """Direct irradiance / pi under constant light at the floor's vertex at the origin, and its standard error.
+
+    The third number is the height at which its rays start, world units.
+    """
     vertex = int(np.argmin(np.linalg.norm(scene.positions, axis=1)))
     assert np.linalg.norm(scene.positions[vertex]) < 1e-6
     lighting = prt.CubemapLighting(8)
@@ -151,24 +155,26 @@ def irradiance_at_origin(scene: prt.Scene, seeds: int = 64) -> tuple[float, floa
         solver.elements(np.full(len(texels), vertex), texels, seed=k).sum(dtype=np.float64)
         for k in range(seeds)
     ]
-    return float(np.mean(runs)), float(np.std(runs, ddof=1) / np.sqrt(seeds))
+    height = float(mi.math.RayEpsilon) * (1 + np.abs(scene.normalised_positions[vertex]).max()) / scene.scale
+    return float(np.mean(runs)), float(np.std(runs, ddof=1) / np.sqrt(seeds)), height
 
 
 SEGMENTS = 24
+UP = np.array([0.0, 1.0, 0.0])
 DOME = [ring(np.cos(a), np.sin(a), SEGMENTS) for a in np.radians([0, 20, 40, 60])]
 FORM_FACTORS = {
-    "open plane": ({}, lambda: 1.0),
+    "open plane": ({}, lambda start: 1.0),
     "under a disk": (
         {"disk": (np.concatenate([[[0, 0.7, 0]], ring(0.5, 0.7, SEGMENTS)]), None)},
-        lambda: 1 - share_of_view(np.zeros(3), np.array([0, 1, 0]), ring(0.5, 0.7, SEGMENTS)),
+        lambda start: 1 - share_of_view(start, UP, ring(0.5, 0.7, SEGMENTS)),
     ),
     "in a cylinder": (
         {"cylinder": surface([ring(0.8, y, SEGMENTS) for y in (0, 0.5, 1.0)], inwards=True)},
-        lambda: share_of_view(np.zeros(3), np.array([0, 1, 0]), ring(0.8, 1.0, SEGMENTS)),
+        lambda start: share_of_view(start, UP, ring(0.8, 1.0, SEGMENTS)),
     ),
     "under a dome with a hole": (
         {"dome": surface(DOME, inwards=True)},
-        lambda: share_of_view(np.zeros(3), np.array([0, 1, 0]), DOME[-1]),
+        lambda start: share_of_view(start, UP, DOME[-1]),
     ),
 }
 
@@ -182,10 +188,10 @@ def test_known_form_factors(kind, artefact):
     sides (radius 0.8, height 1); at the centre of a hemispherical dome, open from 60 degrees up. Texel basis, n = 8,
     6 x 6 strata, mean of 64 seeds. For circles the values would be 1, 1 - R²/(R² + h²), R²/(R² + h²) and sin² 30°.
 
-    Expected: within 3 standard errors (of the 64 seeds) and 1e-4 (float rounding at the polygon's edge and the offset
-    of the ray's start, 1e-4 of the scene); that is under 0.5%, so that a bias of 2% fails.
+    Expected: within 3 standard errors (of the 64 seeds) and 3e-5 (float32) of the formula at the place where the rays
+    start, 1e-4 of the scene over the floor. That is under 0.5%, so that a bias of 2% fails.
 
-    Result: off by less than 0.1%.
+    Result: 0.66446 (known 0.66447), 0.38787 (0.38771), 0.24787 (0.24803), each +- 0.00014.
     """
     shapes, exact = FORM_FACTORS[kind]
     built = {}
@@ -194,9 +200,9 @@ def test_known_form_factors(kind, artefact):
             n = np.arange(SEGMENTS)
             triangles = np.stack([0 * n, 1 + n, 1 + np.roll(n, -1)], axis=-1)
         built[name] = mesh(name, vertices, triangles, GREY)
-    value, error = irradiance_at_origin(build(1.0, floor=FLOOR, **built))
-    known = exact()
-    tolerance = 3 * error + 1e-4
+    value, error, height = irradiance_at_origin(build(1.0, floor=FLOOR, **built))
+    known = exact(height * UP)
+    tolerance = 3 * error + 3e-5
     print(f"{kind}: {value:.5f} +- {error:.5f}, known {known:.5f}")
     assert tolerance < 0.005 * known
     assert abs(value - known) < tolerance
@@ -256,7 +262,7 @@ def test_an_integrating_sphere(artefact):
     """Rationale: inside a sphere every point sees every area alike, so interreflection has a closed form.
 
     A hollow sphere of albedo r, open in a cap that is the share f of its area, under constant light of radiance 1. A
-    wall point sees the opening with irradiance / pi = f; each bounce keeps r (1 - f) of the light. So irradiance / pi is
+    wall point sees the opening with irradiance / pi = f; each bounce keeps r (1 - f) of the light. Irradiance / pi is
     f (1 + q + ... + q^k), q = r (1 - f), for k interreflections: max_depth 2 + k, and f / (1 - q) without a limit.
 
     r = 0.8, opening of half-angle 60 degrees (f = 0.25), 48 x 24 facets, shading normals of the sphere. 40 wall
@@ -264,9 +270,9 @@ def test_an_integrating_sphere(artefact):
 
     Expected: the mean over vertices within 3 standard errors and the tessellation: a chord of 48 lies (pi / 48)² / 2 =
     0.2% inside of the circle, areas and f are off by up to twice that, 0.4%. Together under 1%, so that a bias of 2%
-    fails, and so does a bounce too many or too few (checked).
+    fails; a bounce too many or too few is 3% at least.
 
-    Result: off by RESULT_SPHERE.
+    Result: off by -0.3%, -0.1%, -0.1% and -0.3% (max_depth 2, 3, 5, -1), of which 0.1% is one standard error.
     """
     albedo, segments = 0.8, 48
     polar = np.radians(
@@ -327,9 +333,10 @@ def test_reciprocity_with_a_lamp_at_the_vertex(artefact):
     A lamp of edge 0.02 just over a ground vertex beside the ball; three directions of n = 2; max_depth 4. The ball is
     shaded flat: smooth shading normals are not reciprocal (Veach 1997, 5.3), and cost up to 12% here.
 
-    Expected: equal within 3 standard errors of the two; those are under 0.7%, so that 2% would be seen (checked).
+    Expected: equal within 3 standard errors of the two; together they are under 0.5%, so that 2% would be
+    seen (checked).
 
-    Result: RESULT_LAMP
+    Result: together -0.25% +- 0.34%.
     """
     shapes = still_life(COLOURS)
     vertices, triangles = bumpy_ball()
@@ -382,9 +389,12 @@ def test_reciprocity_with_a_lamp_at_the_vertex(artefact):
         f"ratios {np.round(ours / theirs, 4).tolist()}, standard errors {np.round(error / theirs, 4).tolist()}"
     )
     together = np.sqrt((error**2).sum()) / theirs.sum()
-    assert together < 0.007
+    print(f"together {ours.sum() / theirs.sum() - 1:+.3%} +- {together:.3%}")
+    assert together < 0.005
     assert (np.abs(ours - theirs) < 3 * error + 0.002 * theirs).all()
     assert abs(ours.sum() / theirs.sum() - 1) < 3 * together
+    assert abs(1.02 * ours.sum() / theirs.sum() - 1) > 3 * together
+    assert abs(0.98 * ours.sum() / theirs.sum() - 1) > 3 * together
 
     figure = Figure(figsize=(5, 3))
     axes = figure.subplots()
