@@ -70,14 +70,15 @@ def draw(difference: np.ndarray, reference: np.ndarray, z: np.ndarray | None = N
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
 def test_scale(grey_scene, artefact, scale):
-    """Rationale: Mitsuba's ray offsets are absolute near the origin; scenes in millimetres or kilometres differ in nothing.
+    """Rationale: Mitsuba's ray offsets are absolute near the origin; a scene's unit of length must not matter.
 
-    The ball and the box over the ground, 1e-4 and 1e4 times as large. All 384 columns of the direct part; the indirect
+    The ball and the box over the ground, 1e-4 and 1e4 times as large. All 384 columns of the direct part; the
+    indirect
     part at n = 2 with 256 paths, other random numbers on either side.
 
     Expected: direct within 1e-4 in relative L2; indirect the same within 3 standard errors (of 0.3%: 2% would show).
 
-    Result: RESULT_SCALE
+    Result: direct 1e-7; indirect +0.2% and 0.0%, +- 0.3%.
     """
     scaled = build(0.5 * scale, **still_life(place=T().scale(scale)))
     a, b = direct(scaled), direct(grey_scene)
@@ -107,7 +108,7 @@ def test_place(grey_scene, artefact, sizes):
     Expected: moved against rounded: direct within 1e-4 in relative L2, indirect the same in distribution. Against
     the original nothing is promised but what rounding costs: it is measured.
 
-    Result: RESULT_PLACE
+    Result: no difference from the rounded scene. From the original 4e-7 at one size, 5e-3 at 1000 sizes.
     """
     offset = sizes * 3.0 * np.array([1, 1, 1])
     moved, rounded = (build(float("inf"), **moved_meshes(grey_scene, offset, only)) for only in (False, True))
@@ -123,15 +124,16 @@ def test_place(grey_scene, artefact, sizes):
 
 
 def test_quarter_turn(grey_scene, artefact):
-    """Rationale: a quarter turn about the vertical maps texels onto texels, so columns change places and nothing else.
+    """Rationale: a quarter turn about the vertical maps texels onto texels, so columns change places and
+    nothing else.
 
     The scene turned by exactly 90 degrees (x -> -z). Column j of the original is the column of the turned texel.
 
-    Expected: at most one direct element in 10000 differs (a border vertex whose triangles are equally wide may move into
-    another one of these, and light that grazes an edge with it); indirect the same in distribution. Without the permutation, or with the turn the other way round,
-    it is far off.
+    Expected: at most one direct element in 10000 differs (a border vertex whose triangles are equally wide may move
+    into another one of these, and light that grazes an edge with it); indirect the same in distribution. Without the
+    permutation it is far off.
 
-    Result: RESULT_TURN
+    Result: 0.003% differ, 0.6% in relative L2 (87% without the permutation); indirect 0.0% +- 0.3%.
     """
     matrix = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     place = np.eye(4)
@@ -216,7 +218,7 @@ def test_order_of_triangles_whose_normals_are_computed(artefact):
 
     Expected: the same hash, the same normals to the last bit.
 
-    Result: RESULT_COMPUTED
+    Result: normals within 1e-7; components that cancel to zero are where the order would show.
     """
     vertices, triangles = bumpy_ball()
     orders = [np.random.default_rng(k).permutation(len(triangles)) for k in range(20)]
@@ -258,15 +260,16 @@ def test_merged_shapes(artefact):
 def test_block_size(coloured_scene, basis, monkeypatch, artefact):
     """Rationale: how many rows share a wavefront is a matter of memory.
 
-    A whole precomputation with wavefronts of 2^22 and more paths, and of 5000 (blocks of 39 and 52 rows, with a rest).
+    A whole precomputation with wavefronts of 2^22 and more lanes, and of 2^14: two to five blocks of rows,
+    with a rest.
 
     Expected: bit-identical rows, and the same estimate of the error.
 
     Result: they are.
     """
     whole = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
-    monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 5000)
-    monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 5000)
+    monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 1 << 14)
+    monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 1 << 14)
     parts = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
     ids = np.arange(coloured_scene.n_vertices)
     a, b = whole.rows(ids), parts.rows(ids)
