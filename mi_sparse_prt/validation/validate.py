@@ -267,8 +267,9 @@ def _image_error(
         exact = []  # images of Mitsuba's own vertices, interpolated as ours are
         for k in seeds:
             radiance = reference_vertices(scene, background, rays, max_depth, max(1, spp // 8), seed=k)
+            # a black albedo hides the irradiance from Mitsuba's radiance: there ours stands in
             irradiance = np.divide(
-                radiance, scene.albedo, out=np.zeros_like(radiance), where=scene.albedo > 0
+                radiance, scene.albedo, out=transport.irradiance(lighting), where=scene.albedo > 0.01
             )
             relit = RelitIntegrator(RelitScene(scene, irradiance, background))
             image = mi.render(

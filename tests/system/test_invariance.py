@@ -268,7 +268,7 @@ def test_block_size(coloured_scene, basis, monkeypatch, artefact):
     Result: they are.
     """
     whole = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
-    monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 1 << 14)
+    monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 1 << 12)
     monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 1 << 14)
     parts = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
     ids = np.arange(coloured_scene.n_vertices)
