@@ -29,7 +29,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_show_locals=False,
-    help="Precomputed light transport for Mitsuba 3 scenes: compute a matrix once, relight the scene in milliseconds.",
+    help="Precomputed light transport for Mitsuba 3 scenes: compute a matrix once, relight the scene at once.",
     epilog="Start with: mi-sparse-prt precompute SCENE.xml -o SCENE.prt",
 )
 
@@ -291,7 +291,8 @@ def relight(
                 report["vertices"] = {"path": str(vertices), "mean": radiance.mean(axis=0).tolist()}
             if output is not None:
                 with clock.phase("render"):
-                    image = prt.render(loaded, transport, light, sensor, spp)  # [row, column, rgb]
+                    # [row, column, rgb]
+                    image = prt.render(loaded, transport, light, sensor, spp, progress=not quiet)
                 files[output] = image_bytes(image, output.suffix.lower(), exposure)
                 report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
         for path, content in files.items():

@@ -6,11 +6,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.scene import Scene
+
+SAMPLES_PER_PASS = 16  # so that a progress bar moves
 
 
 class RelitScene:
@@ -91,6 +94,7 @@ def render(
     sensor: int | mi.Sensor = 0,
     spp: int = 64,
     seed: int = 0,
+    progress: bool = False,
 ) -> NDArray[np.float32]:
     """Render a camera's view of the relit scene.
 
@@ -106,6 +110,8 @@ def render(
     spp : int
         Samples per pixel (for edges and textures: the light itself has no noise).
     seed : int
+    progress : bool
+        Show a progress bar.
 
     Returns
     -------
@@ -125,8 +131,17 @@ def render(
         sensor = sensors[sensor]
     irradiance = transport.for_scene(scene).irradiance(environment)
     relit = RelitScene(scene, irradiance, background_emitter(environment, transport))
-    image = mi.render(scene.mitsuba, sensor=sensor, integrator=RelitIntegrator(relit), spp=spp, seed=seed)
-    return np.array(image)[..., :3]
+    integrator = RelitIntegrator(relit)
+    passes = []
+    with tqdm(total=spp, desc="render", unit=" spp", disable=not progress) as bar:
+        for first in range(0, spp, SAMPLES_PER_PASS):
+            samples = min(SAMPLES_PER_PASS, spp - first)
+            rendered = mi.render(
+                scene.mitsuba, sensor=sensor, integrator=integrator, spp=samples, seed=seed * spp + first
+            )
+            passes.append(np.array(rendered)[..., :3] * np.float32(samples / spp))
+            bar.update(samples)
+    return np.sum(passes, axis=0, dtype=np.float32)
 
 
 def background_emitter(

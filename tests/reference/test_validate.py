@@ -1,113 +1,264 @@
-"""Whole matrices against Mitsuba's own render of them."""
+"""`prt.validate`: a matrix against Mitsuba's own render of it, and whether it would notice."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import still_life
+from conftest import COLOURS, T, build, diffuse, still_life
+from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.validation.reference import ReferenceMatrix, reference_image
 from mi_sparse_prt.validation.validate import matrix_errors
 
-SCENES = Path(__file__).parents[2] / "scenes_xml"
+LIGHTING = prt.CubemapLighting(2)
+SCENES = sorted((Path(__file__).parents[2] / "scenes_xml").glob("*.xml"))
 
 
-@pytest.fixture(scope="module", params=["direction", "texel"])
-def checked(request, coloured_scene, small_lighting):
-    """All columns of a small coloured scene: its matrix and the validation."""
-    transport = prt.precompute(
-        coloured_scene, small_lighting, basis=request.param, spp=64, strata=4, progress=False
+# ------------------------------------------------------------------------------------ arithmetic of errors
+
+
+@pytest.fixture
+def noisy() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A matrix (40 rows, 200 columns), and two references of it with noise of 5%."""
+    rng = np.random.default_rng(3)
+    truth = rng.random((40, 200, 3)) + 0.5
+    noise = 0.05 * np.linalg.norm(truth) / np.sqrt(truth.size) * np.sqrt(2)  # of the mean of the two: 5%
+    return (truth, *(truth + noise * rng.normal(size=truth.shape) for _ in range(2)))
+
+
+ROWS, COLUMNS = np.arange(40), np.arange(200)
+MESHES = (MeshRange("small", slice(0, 10)), MeshRange("large", slice(10, 1000)))
+
+
+def test_noise_is_taken_out(noisy):
+    truth, x, y = noisy
+    report = matrix_errors(truth, x, y, ROWS, COLUMNS, MESHES)
+    assert report["relative_l2"]["total"] < 0.01
+    assert report["reference_noise"] == pytest.approx(0.05, rel=0.05)
+    assert report["with_noise"] == pytest.approx(0.05, rel=0.05)
+    biased = matrix_errors(1.02 * truth, x, y, ROWS, COLUMNS, MESHES)
+    assert biased["relative_l2"]["total"] == pytest.approx(0.02, rel=0.15)
+    assert set(biased["relative_l2"]["meshes"]) == {"small", "large"}
+
+
+def test_meshes_count_by_their_vertices(noisy):
+    """10 of 10 vertices of one mesh, 30 of 990 of the other: an error in the small one is diluted."""
+    truth = noisy[0]
+    wrong = truth.copy()
+    wrong[:10] *= 1.3
+    report = matrix_errors(wrong, truth, truth, ROWS, COLUMNS, MESHES)
+    assert report["relative_l2"]["meshes"] == {"small": pytest.approx(0.3), "large": 0}
+    square = (truth**2).sum(axis=(1, 2))
+    weighted = 10 * square[:10].mean(), 990 * square[10:].mean()
+    assert report["relative_l2"]["total"] == pytest.approx(0.3 * np.sqrt(weighted[0] / sum(weighted)))
+
+
+def test_worst_rows_and_columns_are_named(noisy):
+    truth = noisy[0]
+    wrong = truth.copy()
+    wrong[17] *= 2
+    wrong[:, 123] *= 1.5
+    wrong[5] *= 1e-9  # a black row is an error of 100%, not of infinity
+    report = matrix_errors(
+        wrong, truth, truth, ROWS + 100, COLUMNS + 1000, (MeshRange("all", slice(0, 200)),)
     )
-    return transport, prt.validate(
-        coloured_scene, transport, n_rows=48, n_columns=96, spp=1024, progress=False
+    assert report["row_worst"]["vertex"] == 117
+    assert report["row_worst"]["relative_l2"] == pytest.approx(1, abs=0.01)
+    assert report["column_worst"]["texel"] == 1123
+    assert 0 < report["row_95th_percentile"] < report["row_worst"]["relative_l2"]
+
+
+def test_darkness_has_no_error():
+    zero = np.zeros((40, 200, 3))
+    report = matrix_errors(zero, zero, zero, ROWS, COLUMNS, MESHES)
+    assert (
+        report["relative_l2"]["total"] == report["reference_noise"] == report["row_worst"]["relative_l2"] == 0
+    )
+    lit = zero.copy()
+    lit[0, 0] = 1
+    assert matrix_errors(lit, zero, zero, ROWS, COLUMNS, MESHES)["relative_l2"]["total"] == 1
+
+
+# ------------------------------------------------------------------------------------ whole validations
+
+
+@pytest.fixture(scope="module")
+def scene() -> prt.Scene:
+    """The coloured still life with a camera and an uneven sky."""
+    texels = np.random.default_rng(0).random((6, 2, 2, 3), dtype=np.float32)
+    film = {"type": "hdrfilm", "width": 30, "height": 20, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = T().look_at(origin=[1.5, 2.2, 4], target=[0, 0.4, 0], up=[0, 1, 0])
+    return build(
+        **still_life(COLOURS),
+        sky={"type": "cubemap", "data": mi.TensorXf(texels)},
+        camera={"type": "perspective", "fov": 40, "to_world": view, "film": film},
     )
 
 
-def test_error_against_mitsuba_is_what_the_matrix_says(checked):
-    """Rationale: two independent figures, held-out elements and a full render, of one error.
-
-    Expected: within 25% of each other plus three standard errors of the estimate: 48 vertices were rendered.
-    """
-    transport, validation = checked
-    estimated = transport.report["estimated_error"]
-    measured = validation.report["relative_l2"]["total"]
-    assert 0 < measured < 0.2
-    assert abs(measured - estimated["total"]) < 0.25 * measured + 3 * estimated["standard_error"]["total"]
+def precomputed(scene: prt.Scene, **parameters: object) -> LightTransport:
+    return prt.precompute(scene, LIGHTING, **({"spp": 64, "max_depth": 4, "progress": False} | parameters))
 
 
-def test_direct_part_is_mitsubas(checked):
-    """Expected: at most 0.1% of the elements differ by more than 1e-4, and every vertex is reached."""
-    _, validation = checked
-    assert validation.report["direct_at_hits"] <= 1e-3
-    assert validation.report["missed_vertices"] == 0
-
-
-def test_a_wrong_matrix_is_found(checked, coloured_scene):
-    """A matrix that is 10% too bright must be reported so: the error of the good one and 10% add as squares."""
-    transport, validation = checked
-    bright = type(transport)(**{**vars(transport), "albedo": transport.albedo * np.float32(1.1)})
-    wrong = prt.validate(coloured_scene, bright, n_rows=48, n_columns=96, spp=256, progress=False)
-    good = validation.report["relative_l2"]["total"]
-    assert wrong.report["relative_l2"]["total"] == pytest.approx(np.hypot(1.1 * good, 0.1), rel=0.1)
-
-
-def test_validation_is_saved(checked, tmp_path):
-    _, validation = checked
-    validation.save(tmp_path / "out")
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"report.json", "errors.png", "rows.png"}
-
-
-def test_noise_of_the_reference_is_taken_out():
-    """A perfect matrix against two noisy references: the plain difference is the noise, the corrected one is near 0."""
-    rng = np.random.default_rng(0)
-    exact = rng.random((40, 60, 3)).astype(np.float32)
-    first, second = (exact + rng.normal(0, 0.1, exact.shape).astype(np.float32) for _ in range(2))
-    meshes = (prt.matrix.MeshRange("a", slice(0, 40)),)
-    report = matrix_errors(exact, first, second, np.arange(40), np.arange(60), meshes)
-    noise = 0.1 / np.sqrt(2) / np.sqrt(1 / 3)
-    assert report["with_noise"] == pytest.approx(noise, rel=0.05)
-    assert report["reference_noise"] == pytest.approx(noise, rel=0.05)
-    assert report["relative_l2"]["total"] < 0.2 * noise
-    scaled = matrix_errors(1.02 * exact, first, second, np.arange(40), np.arange(60), meshes)
-    assert scaled["relative_l2"]["total"] == pytest.approx(0.02, rel=0.5)
-
-
-def test_image_of_a_relit_scene(tmp_path):
-    """The whole way from XML: relit image against ``path`` under the same cubemap.
-
-    Expected: vertices 0.5 apart smear the shadow, so 10% is what this resolution allows; noise is taken out.
-    """
-    import mitsuba as mi
-
-    from mi_sparse_prt.scene import Scene
-
-    shapes = still_life()
-    sensor = {
-        "type": "perspective",
-        "to_world": mi.ScalarTransform4f().look_at([2, 2, 3], [0, 0.3, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 64, "height": 48},
+def validated(scene: prt.Scene, transport: LightTransport, **parameters: object) -> prt.Validation:
+    defaults = {
+        "n_rows": 100,
+        "n_columns": 24,
+        "spp": 512,
+        "image_width": 24,
+        "image_spp": 256,
+        "progress": False,
     }
-    loaded = mi.load_dict(
-        {"type": "scene", "sensor": sensor, "sky": {"type": "constant"}, **shapes}, optimize=False
-    )
-    scene = Scene.from_mitsuba(loaded, 0.2)
-    transport = prt.precompute(scene, prt.CubemapLighting(4), basis="texel", progress=False)
-    validation = prt.validate(
-        scene, transport, n_rows=8, n_columns=8, spp=16, progress=False, image_width=64, image_spp=128
-    )
-    assert validation.report["image"]["relative_l2"] < 0.1
-    assert 0 < validation.report["image"]["interpolation"] < 0.1
-    assert "image" in validation.figures
+    return prt.validate(scene, transport, **(defaults | parameters))
+
+
+@pytest.mark.parametrize("basis", ["direction", "texel"])
+def test_a_good_matrix_passes(scene, basis, tmp_path):
+    """Report, figures and files; the measured error is about what the matrix said of itself."""
+    transport = precomputed(scene, basis=basis, strata=4)
+    validation = validated(scene, transport)
+    report = validation.report
+    assert json.loads(json.dumps(report)) == report
+    estimated = transport.report["estimated_error"]
+    assert report["estimated_error"] == estimated
+    assert report["relative_l2"]["total"] == pytest.approx(estimated["total"], rel=0.35)
+    assert report["relative_l2"]["total"] < 0.05
+    assert report["relative_l2"]["meshes"].keys() == {"ground", "ball", "box"}
+    assert 0 < report["reference_noise"] < 0.03
+    assert report["with_noise"] >= report["relative_l2"]["total"]
+    assert report["direct_at_hits"] < 1e-3
+    assert 0 < report["hit_against_vertex"] < 0.2
+    assert report["missed_vertices"] == 0
+    assert report["parameters"]["rows"] == pytest.approx(100, abs=3)
+    assert report["parameters"]["columns"] == 24
+    assert report["image"]["relative_l2"] < 0.1
+    assert 0 <= report["image"]["flip"] < 0.1
+    assert 0 < report["image"]["reference_noise"] < 0.1
+
+    assert all(isinstance(figure, Figure) for figure in validation.figures.values())
+    assert {"errors", "rows", "image"} <= validation.figures.keys()
+    validation.save(tmp_path / "new" / "folder")
+    assert json.loads((tmp_path / "new" / "folder" / "report.json").read_text()) == report
+    for name in validation.figures:
+        assert (tmp_path / "new" / "folder" / f"{name}.png").stat().st_size > 5000
+
+
+def test_a_bad_matrix_is_noticed(scene):
+    """2% too bright; no indirect light; a texel's column lost; one mesh dark: each is seen where it is."""
+    transport = precomputed(scene, spp=2048)
+
+    def report(**changes: object) -> dict:
+        return validated(scene, replace(transport, **changes), image=False).report
+
+    good = report()
+    assert good["relative_l2"]["total"] < 0.01
+
+    brighter = report(albedo=np.float32(1.02) * transport.albedo)
+    expected = np.hypot(good["relative_l2"]["total"], 0.02)
+    assert brighter["relative_l2"]["total"] == pytest.approx(expected, rel=0.25)
+    assert brighter["relative_l2"]["total"] > good["relative_l2"]["total"] + 0.01
+
+    assert report(indirect=None)["relative_l2"]["total"] > 0.1
+
+    bits = transport.direct.bits.copy()
+    bits[:, 0] &= ~np.uint32(1 << 9)  # a texel of the +Y face
+    lost = report(direct=replace(transport.direct, bits=bits))
+    assert lost["column_worst"]["texel"] == 9
+    assert lost["column_worst"]["relative_l2"] > 0.8
+
+    albedo = transport.albedo.copy()
+    albedo[scene.meshes[2].vertices] = 0
+    dark = report(albedo=albedo)
+    assert dark["relative_l2"]["meshes"]["box"] > 0.9
+    assert dark["relative_l2"]["meshes"]["ground"] < 0.01
+
+
+def test_coarse_indirect_light(scene):
+    """The estimate from held-out elements includes what interpolating between coarse texels costs; so is measured."""
+    transport = precomputed(scene, basis="texel", indirect_resolution=1, spp=512, strata=6)
+    report = validated(scene, transport, image=False, spp=1024).report
+    assert report["relative_l2"]["total"] == pytest.approx(report["estimated_error"]["total"], rel=0.3)
+    assert report["relative_l2"]["total"] > 2 * precomputed(scene, basis="texel", spp=512, strata=6).report["estimated_error"]["total"]  # fmt: skip
+
+
+def test_rows_in_another_order(scene):
+    """A matrix is validated against a scene whose shapes come the other way round."""
+    shapes = still_life(COLOURS)
+    other = build(**dict(reversed(list(shapes.items()))))
+    assert other.hash == scene.hash
+    report = validated(other, precomputed(scene), spp=128).report
+    assert report["relative_l2"]["total"] < 0.05
+    assert "image" not in report  # no camera, no environment
+
+
+def test_a_matrix_of_another_scene_is_refused(scene, grey_scene):
+    with pytest.raises(prt.PrtError, match="another scene"):
+        prt.validate(grey_scene, precomputed(scene, max_depth=2), progress=False)
+
+
+# ------------------------------------------------------------------------------------ the reference itself
+
+
+def test_reference_columns(scene):
+    """Seeds and columns are independent of each other and repeatable; rows are those asked for."""
+    some = np.array([0, 150, 300])
+    reference = ReferenceMatrix(scene, LIGHTING, "direction", 3, some)
+    a = reference.columns(np.array([8, 9]), spp=16, seed=1)
+    assert a.shape == (3, 2, 3)
+    assert np.array_equal(a, reference.columns(np.array([8, 9]), spp=16, seed=1))
+    assert np.array_equal(a[:, 1:], reference.columns(np.array([9]), spp=16, seed=1))
+    assert not np.array_equal(a, reference.columns(np.array([8, 9]), spp=16, seed=2))
+    every = ReferenceMatrix(scene, LIGHTING, "direction", 2, np.arange(scene.n_vertices))
+    only = ReferenceMatrix(scene, LIGHTING, "direction", 2, some)
+    texel = np.array([9])
+    assert np.array_equal(every.columns(texel, spp=1)[some], only.columns(texel, spp=1))
+
+
+def test_lamps_do_not_take_part_in_reference_images():
+    """An area emitter in the scene is left out of the picture that a matrix is compared with."""
+    lamp = {"type": "rectangle", "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], 90).scale(0.2)}
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": diffuse(0.5, 0.5, 0.5)}
+    scene = scene_with_lamp(floor, {**lamp, "emitter": {"type": "area", "radiance": 50.0}})
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    view = T().look_at(origin=[0, 2, 2], target=[0, 0, 0], up=[0, 1, 0])
+    camera = mi.load_dict({"type": "perspective", "to_world": view, "film": film})
+    image = reference_image(scene, mi.load_dict({"type": "constant"}), camera, 3, spp=64, seed=0)
+    assert image.max() < 1.01
+
+
+def scene_with_lamp(floor: dict, lamp: dict) -> prt.Scene:
+    with pytest.warns(prt.PrtWarning, match="area emitter"):
+        return build(1.0, floor=floor, lamp=lamp)
+
+
+# ------------------------------------------------------------------------------------ the five scenes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bunny", "dancer", "spot", "cornell", "terrace"])
-def test_scenes(name):
-    """Every scene of the collection at 6 x 8 x 8: estimate and reference agree, the direct part is Mitsuba's."""
-    scene = prt.load_scene(SCENES / f"{name}.xml")
-    transport = prt.precompute(scene, prt.CubemapLighting(8), spp=16, progress=False)
-    report = prt.validate(scene, transport, n_rows=256, n_columns=384, progress=False, image=False).report
-    assert report["direct_at_hits"] <= 1e-3
-    assert report["relative_l2"]["total"] == pytest.approx(
-        transport.report["estimated_error"]["total"], rel=0.2
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.errors.PrtWarning")
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_scenes(path, tmp_path):
+    """Each scene of scenes_xml at n = 8, texel basis: 300 rows and all columns, and its picture.
+
+    Tessellated to coarse edges; files with their own fine meshes keep these. Expected: the measured error is what the
+    matrix says of itself (within a third), under 8% at 16 samples per element; no vertex is missed; the direct part at
+    Mitsuba's own hits differs on less than 0.1% of elements.
+    """
+    scene = prt.load_scene(path, edge_length=0.25, width=160, height=120)
+    lighting = prt.CubemapLighting(8)
+    transport = prt.precompute(scene, lighting, basis="texel", spp=16, indirect_resolution=4, progress=False)
+    validation = prt.validate(
+        scene, transport, n_rows=300, n_columns=384, spp=256, image_width=160, image_spp=512, progress=False
     )
+    report = validation.report
+    print(json.dumps(report, indent=1))
+    validation.save(Path(__file__).parents[1] / "artefacts" / f"validate_{path.stem}")
+    assert report["missed_vertices"] == 0
+    assert report["direct_at_hits"] < 1e-3
+    assert report["relative_l2"]["total"] < 0.08
+    assert report["relative_l2"]["total"] == pytest.approx(report["estimated_error"]["total"], rel=0.33)
+    assert report["image"]["relative_l2"] < 0.05
