@@ -151,8 +151,9 @@ def angle_weighted_normals(mesh: TriangleMesh) -> tuple[NDArray[np.float32], NDA
         fallback[vertex] = face
     length = np.linalg.norm(total, axis=1)
     cancelled = length <= 1e-6 * weight
-    normals = _normalised(np.where(cancelled[:, None], fallback, total)).astype(np.float32)
-    return normals, np.where(cancelled, np.inf, weight / np.where(cancelled, 1.0, length))
+    # rounded, so that components that cancel to zero are zero in whatever order they were summed
+    normals = np.round(_normalised(np.where(cancelled[:, None], fallback, total)), 12) + 0.0
+    return normals.astype(np.float32), np.where(cancelled, np.inf, weight / np.where(cancelled, 1.0, length))
 
 
 def settle_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> TriangleMesh:

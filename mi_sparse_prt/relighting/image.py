@@ -14,6 +14,7 @@ from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.scene import Scene
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
+_SEEDS = 9973  # passes of neighbouring seeds stay apart
 
 
 class RelitScene:
@@ -137,7 +138,7 @@ def render(
         for first in range(0, spp, SAMPLES_PER_PASS):
             samples = min(SAMPLES_PER_PASS, spp - first)
             rendered = mi.render(
-                scene.mitsuba, sensor=sensor, integrator=integrator, spp=samples, seed=seed * spp + first
+                scene.mitsuba, sensor=sensor, integrator=integrator, spp=samples, seed=seed + _SEEDS * first
             )
             passes.append(np.array(rendered)[..., :3] * np.float32(samples / spp))
             bar.update(samples)
