@@ -112,6 +112,8 @@ class Scene:
             _mitsuba_mesh(m, k.bsdf, positions=self.normalised_positions[view.vertices])
             for m, k, view in zip(meshes, materials, self.meshes, strict=True)
         ]
+        # An area emitter may outlive its shape, and Mitsuba then reads freed memory: the original is kept
+        self._original = mitsuba
         self.mitsuba: mi.Scene = _mitsuba_scene(world, self.meshes, mitsuba)
         self.normalised: mi.Scene = _mitsuba_scene(unit, self.meshes)
         self.albedo = np.concatenate(
@@ -182,6 +184,15 @@ class Scene:
     def _warn(self) -> None:
         for sentence in self.warnings:
             warnings.warn(sentence, PrtWarning, stacklevel=3)
+
+    def unlit_shapes(self) -> list[mi.Mesh]:
+        """The world-space meshes without their area emitters, for scenes with other light."""
+        return [
+            _mitsuba_mesh(mesh, material.bsdf) if shape.is_emitter() else shape
+            for shape, mesh, material in zip(
+                self.mitsuba.shapes(), self._surfaces, self._materials, strict=True
+            )
+        ]
 
     @property
     def n_vertices(self) -> int:

@@ -90,7 +90,7 @@ def reference_image(
     scene: Scene, background: mi.Emitter, sensor: mi.Sensor, max_depth: int, spp: int, seed: int
 ) -> NDArray[np.float32]:
     """Mitsuba's ``path`` image (height, width, 3) of a scene's meshes under one environment emitter, world units."""
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.mitsuba.shapes()) if not shape.is_emitter()}
+    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.unlit_shapes())}
     lit = mi.load_dict({**watertight_scene(), "light": background, **shapes})
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
