@@ -321,7 +321,7 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
     """
     scene = glossy_scene()
     rows = np.arange(0, scene.meshes[0].vertices.stop, 3)
-    channels = compare(scene, rows, 1, "texel", 5, 1 << 14, (4, 1 << 12))
+    channels = compare(scene, rows, 1, "texel", 5, 1 << 15, (8, 1 << 12))
     for result, name in zip(channels, ("red", "green", "blue"), strict=True):
         artefact(draw(result), f"_{name}")
         assert_unbiased(result)
