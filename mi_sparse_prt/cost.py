@@ -13,18 +13,24 @@ import mitsuba as mi
 
 
 class Stopwatch:
-    """Seconds of named phases; what belongs to none is ``other``, so that they add up to the total."""
+    """Seconds of named phases; what belongs to none is ``other``, so that they add up to the total.
+
+    Phases may nest: the inner one's time is its own.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._start = time.perf_counter()
+        self._inside = 0.0  # seconds of the phases that ended inside of the one that runs
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Add the time spent inside to a phase."""
-        start = time.perf_counter()
+        start, outer, self._inside = time.perf_counter(), self._inside, 0.0
         yield
-        self.add(name, time.perf_counter() - start)
+        elapsed = time.perf_counter() - start
+        self.add(name, elapsed - self._inside)
+        self._inside = outer + elapsed
 
     def add(self, name: str, seconds: float) -> None:
         """Add seconds to a phase."""

@@ -197,6 +197,45 @@ class Indirect:
         return replace(self, density=self.density[source])
 
 
+@dataclass(frozen=True)
+class Interpolated:
+    """Rows of all vertices as combinations of a few dense rows: A D ([HR10] eq. 4).
+
+    Attributes
+    ----------
+    dense : Visibility or Indirect
+        D, the rows of the densely sampled vertices.
+    weights : (n_v, n_dense) sparse float32
+        A: a row has the weights of a vertex's dense neighbours; that of a dense vertex is 1 at itself.
+    """
+
+    dense: Visibility | Indirect
+    weights: scipy.sparse.csr_array
+
+    @property
+    def nbytes(self) -> int:
+        weights = self.weights
+        return self.dense.nbytes + weights.data.nbytes + weights.indices.nbytes + weights.indptr.nbytes
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        weights = self.weights[np.asarray(ids)]
+        needed = np.unique(weights.indices)
+        dense = self.dense.rows(needed)  # [needed dense row, direction, channel]
+        flat = weights[:, needed] @ dense.reshape(len(needed), -1)
+        return flat.reshape(len(ids), *dense.shape[1:])
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        dense = self.dense.columns(ids)  # [dense row, column, channel]
+        flat = self.weights @ dense.reshape(len(dense), -1)
+        return flat.reshape(len(flat), *dense.shape[1:])
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        return self.weights @ self.dense.relight(lighting)
+
+    def reordered(self, source: Rows) -> Interpolated:
+        return replace(self, weights=self.weights[source])
+
+
 def _in_blocks(matrix: NDArray[Any], vectors: NDArray[np.float32], block: int = 4096) -> NDArray[np.float32]:
     """A product with a matrix of small numbers, converted to float32 one block of rows at a time."""
     product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
@@ -235,8 +274,8 @@ class LightTransport:
     lighting: CubemapLighting
     basis: str
     albedo: NDArray[np.float32]
-    direct: Visibility | MeanCosine
-    indirect: Indirect | None
+    direct: Visibility | MeanCosine | Interpolated
+    indirect: Indirect | Interpolated | None
     meshes: tuple[MeshRange, ...]
     vertex_keys: NDArray[np.uint64]
     scene_hash: str

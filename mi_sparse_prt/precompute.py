@@ -22,6 +22,9 @@ from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.methods.huang2010 import huang2010_parts
+from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.methods.sparse import sparse_parts
 from mi_sparse_prt.planner import IndirectPlan, indirect_solver, plan_indirect
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
@@ -29,6 +32,7 @@ from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.held_out import HeldOut
 
+_METHODS = {"huang2010": huang2010_parts, "sparse": sparse_parts}
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 _PILOT_SHARE = 8  # a forecast traces this fraction of one wavefront
 
@@ -100,14 +104,19 @@ def precompute(
     settings, plans = _planned(scene, lighting, settings, clock)
     direct = DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
     indirect, skipped = _indirect_if_any(scene, settings, clock)
-    forecast = _forecast(direct, indirect, clock, progress)
-    checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
+    if settings.method == "brute_force":
+        forecast = _forecast(direct, indirect, clock, progress)
+        checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
+        parts = _brute_force(direct, indirect, scene, lighting, clock, progress, checkpoint)
+    else:
+        forecast = {}
+        parts = _METHODS[settings.method](scene, direct, indirect, seed, clock, progress)
     transport = LightTransport(
         lighting=lighting,
         basis=basis,
         albedo=scene.albedo,
-        direct=_direct_part(direct, scene, clock, progress),
-        indirect=_indirect_part(indirect, lighting, clock, progress, checkpoint) if indirect else None,
+        direct=parts.direct,
+        indirect=parts.indirect,
         meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
         vertex_keys=points.keys,
         scene_hash=scene.hash,
@@ -116,7 +125,7 @@ def precompute(
         error = _held_out_error(scene, transport, settings)
     transport.report.update(
         {
-            **_evaluated(direct, indirect, skipped),
+            **_evaluated(parts, points, lighting, skipped),
             "estimated_error": error,
             "seconds": clock.report(),
             "stored_bytes": transport.nbytes,
@@ -171,6 +180,31 @@ def _indirect_if_any(
             return solver, grey if scene.grey else []
         reason = "no surface sees another one"
     return None, [f"indirect light: {reason}"]
+
+
+def _brute_force(
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    scene: Scene,
+    lighting: CubemapLighting,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None,
+) -> Parts:
+    """Evaluate every element."""
+    n = len(direct.points)
+    elements = n * lighting.n_directions
+    above = _share_above_horizon(direct.points, lighting)
+    rays = {"direct": int(above * elements) * direct.rays_per_element}
+    if indirect:
+        rays["indirect_paths"] = n * indirect.lighting.n_directions * indirect.spp
+    return Parts(
+        _direct_part(direct, scene, clock, progress),
+        _indirect_part(indirect, lighting, clock, progress, checkpoint) if indirect else None,
+        elements,
+        {"direct": elements, "indirect": n * indirect.lighting.n_directions if indirect else 0},
+        rays,
+    )
 
 
 def _direct_part(
@@ -283,18 +317,24 @@ def _seconds_per_row(solver: DirectTransport | PathTransport, clock: Stopwatch) 
     return second / count
 
 
-def _evaluated(direct: DirectTransport, indirect: PathTransport | None, skipped: list[str]) -> dict[str, Any]:
+def _evaluated(parts: Parts, points: Points, lighting: CubemapLighting, skipped: list[str]) -> dict[str, Any]:
     """What was evaluated and what was not, for the report."""
-    lighting, normals = direct.lighting, direct.points.normals
-    elements = len(normals) * lighting.n_directions
-    some = normals[:: max(1, len(normals) // 1000)]
-    above = float((some @ lighting.directions.T > 0).mean())  # share of elements above the horizon
-    rays = {"direct": int(above * elements) * direct.rays_per_element}
-    if indirect:
-        rays["indirect_paths"] = len(normals) * indirect.lighting.n_directions * indirect.spp
+    above = _share_above_horizon(points, lighting)
     return {
-        "elements_total": elements,
-        "elements_evaluated": elements,
-        "rays": rays,
-        "skipped": [*skipped, f"direct rays below the horizon: {1 - above:.0%} of the elements"],
+        "elements_total": len(points) * lighting.n_directions,
+        "elements_evaluated": parts.elements_evaluated,
+        "elements": parts.elements,
+        "rays": parts.rays,
+        "sampling": parts.sampling,
+        "skipped": [
+            *skipped,
+            *parts.skipped,
+            f"direct rays below the horizon: {1 - above:.0%} of the elements",
+        ],
     }
+
+
+def _share_above_horizon(points: Points, lighting: CubemapLighting) -> float:
+    """Share of elements above the horizon, from a thousand vertices."""
+    some = points.normals[:: max(1, len(points) // 1000)]
+    return float((some @ lighting.directions.T > 0).mean())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 
-METHODS = ("brute_force",)
+METHODS = ("brute_force", "sparse", "huang2010")
 BASES = ("direction", "texel")
 
 
@@ -34,6 +34,14 @@ class Settings:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise PrtError(f"unknown method {self.method!r}; choose one of: {', '.join(METHODS)}")
+        if self.method != "brute_force":
+            if self.basis != "direction":
+                raise PrtError(f'method {self.method!r} works in the direction basis; set basis="direction"')
+            if self.indirect_resolution not in (None, self.resolution):
+                raise PrtError(
+                    f"method {self.method!r} chooses the directions of the indirect light itself; "
+                    "leave indirect_resolution out"
+                )
         if self.basis not in BASES:
             raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")
         for name, least in (("spp", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.matrix import Indirect, Interpolated, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
@@ -136,19 +136,30 @@ def _write(transport: LightTransport, path: str) -> None:
 
 def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {"albedo": transport.albedo, "vertex_keys": transport.vertex_keys}
-    if isinstance(transport.direct, Visibility):
-        arrays |= {"visibility": transport.direct.bits, "normals": transport.direct.normals}
-    else:
-        arrays["mean_cosine"] = transport.direct.fixed
-    if transport.indirect is not None:
-        upsampling = transport.indirect.upsampling
-        arrays |= {
-            "indirect": transport.indirect.density,
-            "upsampling_data": upsampling.data,
-            "upsampling_indices": upsampling.indices,
-            "upsampling_indptr": upsampling.indptr,
-        }
+    direct, indirect = transport.direct, transport.indirect
+    if isinstance(direct, Interpolated):
+        arrays |= _sparse_arrays("direct_weights", direct.weights)
+        direct = direct.dense  # type: ignore[assignment]
+    if isinstance(indirect, Interpolated):
+        arrays |= _sparse_arrays("indirect_weights", indirect.weights)
+        indirect = indirect.dense  # type: ignore[assignment]
+    if isinstance(direct, Visibility):
+        arrays |= {"visibility": direct.bits, "normals": direct.normals}
+    elif isinstance(direct, MeanCosine):
+        arrays |= {"mean_cosine": direct.fixed}
+    if isinstance(indirect, Indirect):
+        arrays |= {"indirect": indirect.density, **_sparse_arrays("upsampling", indirect.upsampling)}
     return arrays
+
+
+def _sparse_arrays(name: str, matrix: scipy.sparse.csr_array) -> dict[str, NDArray[Any]]:
+    """A sparse matrix as three arrays; the number of its columns is known from elsewhere."""
+    return {f"{name}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr")}
+
+
+def _sparse_matrix(name: str, arrays: dict[str, NDArray[Any]], columns: int) -> scipy.sparse.csr_array:
+    data, indices, indptr = (arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr"))
+    return scipy.sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, columns))
 
 
 def _read(array: Any) -> NDArray[Any]:
@@ -160,19 +171,19 @@ def _read(array: Any) -> NDArray[Any]:
 def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
     lighting = CubemapLighting(attributes["resolution"])
     _check_shapes(arrays, lighting)
-    direct: Visibility | MeanCosine
+    direct: Visibility | MeanCosine | Interpolated
     if attributes["basis"] == "direction":
         direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
+        if "direct_weights_data" in arrays:
+            direct = Interpolated(direct, _sparse_matrix("direct_weights", arrays, len(direct.bits)))
     else:
         direct = MeanCosine(arrays["mean_cosine"], lighting)
-    indirect = None
+    indirect: Indirect | Interpolated | None = None
     if attributes["indirect"]:
         density = arrays["indirect"]
-        upsampling = scipy.sparse.csr_array(
-            (arrays["upsampling_data"], arrays["upsampling_indices"], arrays["upsampling_indptr"]),
-            shape=(lighting.n_directions, density.shape[1]),
-        )
-        indirect = Indirect(density, upsampling, lighting)
+        indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
+        if "indirect_weights_data" in arrays:
+            indirect = Interpolated(indirect, _sparse_matrix("indirect_weights", arrays, len(density)))
     return LightTransport(
         lighting=lighting,
         basis=attributes["basis"],
@@ -189,14 +200,19 @@ def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Li
 def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> None:
     """All arrays are of the same vertices and of the file's lighting."""
     n, m = len(arrays["albedo"]), lighting.n_directions
+    # an interpolated part has fewer rows than the matrix, and weights with a row for each vertex
+    n_direct = len(arrays["normals"]) if "direct_weights_indptr" in arrays else n
+    n_indirect = len(arrays["indirect"]) if "indirect_weights_indptr" in arrays else n
     expected = {
         "albedo": (n, 3),
         "vertex_keys": (n,),
-        "normals": (n, 3),
-        "visibility": (n, -(-m // BITS)),
+        "normals": (n_direct, 3),
+        "visibility": (n_direct, -(-m // BITS)),
         "mean_cosine": (n, m),
-        "indirect": (n, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
+        "indirect": (n_indirect, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
         "upsampling_indptr": (m + 1,),
+        "direct_weights_indptr": (n + 1,),
+        "indirect_weights_indptr": (n + 1,),
     }
     for name, shape in expected.items():
         if name in arrays and arrays[name].shape != shape:

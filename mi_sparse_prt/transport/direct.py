@@ -116,6 +116,15 @@ class DirectTransport:
                 ).numpy()
         return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
 
+    def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Whether points see the centres of texels, (n,) bool; never below the horizon. One ray per element."""
+        seen = np.zeros(len(point_ids), dtype=bool)
+        for a in range(0, len(point_ids), LANES):
+            part = slice(a, a + LANES)
+            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            seen[part] = self._trace(points, self._texels.centre(texels), mi.Mask(True))[0].numpy()
+        return seen
+
     def _lanes(self, n_elements: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Element and stratum of every lane, strata of an element side by side."""
         lane = dr.arange(mi.UInt32, n_elements * self.rays_per_element)

@@ -67,9 +67,14 @@ class PathTransport:
         self._points, self._texels = PointArrays(points), TexelArrays(lighting)
 
     @property
+    def block_elements(self) -> int:
+        """Elements whose paths fill one wavefront."""
+        return max(1, LANES // self.spp)
+
+    @property
     def block_size(self) -> int:
         """Rows whose paths fill one wavefront."""
-        return max(1, LANES // (self.lighting.n_directions * self.spp))
+        return max(1, self.block_elements // self.lighting.n_directions)
 
     def any_hit(self, rays_per_point: int) -> bool:
         """Whether any of a few cosine-distributed rays per point meets a surface."""
@@ -111,7 +116,7 @@ class PathTransport:
         mean = np.zeros((len(point_ids), self.channels), dtype=np.float32)
         variance = np.zeros_like(mean)
         seed = self.seed if seed is None else seed
-        size = max(1, LANES // self.spp)
+        size = self.block_elements
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
             block = self._estimate(mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part]), seed)

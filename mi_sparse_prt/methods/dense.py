@@ -1,0 +1,122 @@
+"""Phase 1 of [HR10]: dense vertices, chosen where transport is complex, and their rows, sampled adaptively in angle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
+from mi_sparse_prt.sampling.bits import Bits
+from mi_sparse_prt.sampling.spatial import choose_dense
+from mi_sparse_prt.scene import Mesh, Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.path import Estimate, PathTransport
+
+
+@dataclass
+class Dense:
+    """Densely sampled vertices and the visibility of their rows.
+
+    Attributes
+    ----------
+    ids : (n_dense,) int64
+        Vertices of the scene, in the order of ``rows``.
+    rows : DenseRows
+    ranks : (n_v,) float32
+        Local rank of every vertex ([HR10] 4.1); 0 where it was not asked for.
+    iterations : dict
+        Mesh name -> list of arrays of the scene's vertices chosen in each iteration.
+    """
+
+    ids: NDArray[np.int64]
+    rows: DenseRows
+    ranks: NDArray[np.float32]
+    iterations: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
+
+    def of_mesh(self, mesh: Mesh) -> NDArray[np.int64]:
+        """Indices into ``ids`` of the dense vertices of a mesh."""
+        return np.flatnonzero((self.ids >= mesh.vertices.start) & (self.ids < mesh.vertices.stop))
+
+
+class DenseSampler:
+    """Collects dense rows, mesh by mesh.
+
+    Parameters
+    ----------
+    scene : Scene
+    direct : DirectTransport
+        Direction basis.
+    grid : AngularGrid
+    clock : Stopwatch
+        Phases ``spatial_sampling``, ``rank``, ``dense_rays`` and ``angular_sampling``.
+    """
+
+    def __init__(self, scene: Scene, direct: DirectTransport, grid: AngularGrid, clock: Stopwatch) -> None:
+        self.scene, self.direct, self.grid, self.clock = scene, direct, grid, clock
+        self._ids: list[NDArray[np.int64]] = []
+        self._rows: list[DenseRows] = []
+        self._ranks = np.zeros(len(scene.positions), np.float32)
+        self._iterations: dict[str, list[NDArray[np.int64]]] = {}
+
+    def choose(self, mesh: Mesh, fraction: float, radius: float, seed: int) -> None:
+        """Take a fraction of a mesh's vertices, by local rank within a radius (normalised frame)."""
+        inside, start = mesh.vertices, mesh.vertices.start
+        samples = choose_dense(
+            self.scene.normalised_positions[inside],
+            self.direct.points.keys[inside],
+            lambda ids: self.add(ids + start),
+            fraction,
+            radius=radius,
+            seed=seed,
+        )
+        self.clock.add("rank", samples.seconds["rank"])
+        self.clock.add("spatial_sampling", samples.seconds["choice"])
+        self._ranks[inside] = samples.ranks
+        self._iterations[mesh.name] = [ids + start for ids in samples.iterations]
+
+    def add(self, ids: NDArray[np.int64]) -> Bits:
+        """Sample the rows of more vertices; returns their visibility."""
+        with self.clock.phase("angular_sampling"):
+            rows = self.grid.sample(self.scene.normals[ids], lambda r, t: self._traced(ids[r], t))
+        self._ids.append(ids)
+        self._rows.append(rows)
+        return rows.visible
+
+    def dense(self) -> Dense:
+        """All that was taken so far."""
+        joined = [
+            np.concatenate([getattr(rows, name) for rows in self._rows])
+            for name in ("visible", "evaluated", "features", "above")
+        ]
+        return Dense(np.concatenate(self._ids), DenseRows(*joined), self._ranks, self._iterations)
+
+    def _traced(self, ids: NDArray[np.int64], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
+        with self.clock.phase("dense_rays"):
+            return self.direct.visible(ids, texels)
+
+
+def indirect_of(
+    solver: PathTransport,
+    vertices: NDArray[np.integer],
+    texels: NDArray[np.integer],
+    name: str,
+    progress: bool,
+) -> Estimate:
+    """Indirect light of every given vertex at every given texel: mean and variance (k, t, channels), vertex by vertex."""
+    shape = (len(vertices), len(texels), solver.channels)
+    mean, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    block = max(1, solver.block_elements // max(1, len(texels)))
+    with tqdm(total=len(vertices), desc=name, unit=" rows", disable=not progress) as bar:
+        for a in range(0, len(vertices), block):
+            ids = np.asarray(vertices[a : a + block], np.uint32)
+            part = solver.elements(
+                np.repeat(ids, len(texels)), np.tile(np.asarray(texels, np.uint32), len(ids))
+            )
+            mean[a : a + len(ids)] = part.mean.reshape(len(ids), *shape[1:])
+            variance[a : a + len(ids)] = part.variance.reshape(len(ids), *shape[1:])
+            bar.update(len(ids))
+    return Estimate(mean, variance)

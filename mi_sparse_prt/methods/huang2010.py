@@ -1,0 +1,205 @@
+"""``method="huang2010"``: sparse precomputation as published ([HR10] sections 4 and 5), nothing added, nothing left out.
+
+Dense vertices: a quarter of the directions, and the features; indirect light on the quarter grid. Sparse vertices: the
+350 best directions, direct and indirect light together; weights of all dense vertices within a radius by L1
+minimization; T(x) = sum of weights times their rows. Sampled values serve the fit and are not kept.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.matrix import Indirect, Interpolated, Visibility
+from mi_sparse_prt.methods.dense import Dense, DenseSampler, indirect_of
+from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.reconstruction.l1 import l1_fit
+from mi_sparse_prt.reconstruction.neighbours import radius_neighbours
+from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.bits import counts, pack
+from mi_sparse_prt.sampling.features import best_features
+from mi_sparse_prt.scene import Mesh, Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.path import PathTransport
+
+DENSE_MODEL, DENSE_GROUND = 0.25, 0.205  # Figure 9
+RADIUS = 0.05  # of the scene's longest side: 0.2 on a ground from -2 to 2 (Figure 8)
+LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 10, 40  # section 5.1; the nearest ones where the radius holds fewer
+DIRECTIONS = 350  # Figure 8
+RELATIVE_LAMBDA = 1e-2
+BLOCK = 4096  # sparse vertices at a time
+
+
+def huang2010_parts(
+    scene: Scene,
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    seed: int,
+    clock: Stopwatch,
+    progress: bool,
+) -> Parts:
+    """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``."""
+    grid = AngularGrid(direct.lighting)
+    sampler = DenseSampler(scene, direct, grid, clock)
+    for mesh in scene.meshes:
+        sampler.choose(mesh, DENSE_GROUND if _flat(scene, mesh) else DENSE_MODEL, RADIUS, seed)
+    dense = sampler.dense()
+    visibility = Visibility(dense.rows.visible, scene.normals[dense.ids], direct.lighting)
+    interreflected = None
+    if indirect is not None:
+        with clock.phase("dense_paths"):
+            density = indirect_of(indirect, dense.ids, grid.texels, "indirect", progress).mean
+        interreflected = Indirect(density.astype(np.float16), grid.upsampling, direct.lighting)
+    weights, evaluated, sparse = _fitted(
+        scene, direct, indirect, dense, visibility, interreflected, clock, progress
+    )
+    quarter = np.zeros(direct.lighting.n_directions, bool)
+    quarter[grid.texels] = True
+    # the paper counts the whole grid, below the horizon too
+    per_dense = counts(dense.rows.evaluated | pack(quarter))
+    elements = int(per_dense.sum()) + int(evaluated.sum())
+    return Parts(
+        Interpolated(visibility, weights),
+        Interpolated(interreflected, weights) if interreflected else None,
+        elements,
+        {
+            "direct": elements,
+            "indirect": len(dense.ids) * len(grid.texels) + int(evaluated.sum()) if indirect else 0,
+        },
+        {
+            "direct": int(counts(dense.rows.evaluated).sum()) + int(evaluated.sum()),
+            "indirect_paths": (len(dense.ids) * len(grid.texels) + int(evaluated.sum())) * indirect.spp
+            if indirect
+            else 0,
+        },
+        sampling={
+            mesh.name: _rates(mesh, dense, per_dense, sparse, evaluated, direct.lighting.n_directions)
+            for mesh in scene.meshes
+        },
+    )
+
+
+def _flat(scene: Scene, mesh: Mesh) -> bool:
+    """Whether a mesh is a plane: the paper's ground."""
+    normals = scene.normals[mesh.vertices]
+    return bool((normals @ normals[0] > 0.999).all())
+
+
+def _fitted(
+    scene: Scene,
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    dense: Dense,
+    visibility: Visibility,
+    interreflected: Indirect | None,
+    clock: Stopwatch,
+    progress: bool,
+) -> tuple[scipy.sparse.csr_array, NDArray[np.int64], NDArray[np.int64]]:
+    """Weights A (n_v, n_dense) of all vertices, and how many elements each sparse vertex (given last) cost."""
+    n = len(scene.positions)
+    is_sparse = np.ones(n, bool)
+    is_sparse[dense.ids] = False
+    sparse = np.flatnonzero(is_sparse)
+    with clock.phase("system"):
+        rows = visibility.rows(np.arange(len(dense.ids)))
+        if interreflected is not None:
+            rows = rows + interreflected.rows(np.arange(len(dense.ids)))
+        # [dense vertex, channel * direction]: channels share the weights
+        stacked = np.ascontiguousarray(np.moveaxis(rows, 2, 1).reshape(len(rows), -1))
+        mean = np.ascontiguousarray(rows.mean(axis=2))
+    owners, columns, values = [dense.ids], [np.arange(len(dense.ids))], [np.ones(len(dense.ids))]
+    cost = np.zeros(len(sparse), np.int64)
+    with tqdm(total=len(sparse), desc="sparse", unit=" vertices", disable=not progress) as bar:
+        for a in range(0, len(sparse), BLOCK):
+            ids = sparse[a : a + BLOCK]
+            with clock.phase("neighbours"):
+                near = _near(scene, ids, dense)
+            with clock.phase("features"):
+                directions = best_features(near, mean, dense.rows.features, DIRECTIONS)
+            cost[a : a + len(ids)] = (directions >= 0).sum(axis=1)
+            sampled = _sampled(direct, indirect, ids, directions, clock)
+            with clock.phase("solver"):
+                fit = _weights(stacked, near, directions, sampled, direct.lighting.n_directions)
+                used = fit != 0
+                owners.append(np.repeat(ids, used.sum(axis=1)))
+                columns.append(near[used])
+                values.append(fit[used])
+            bar.update(len(ids))
+    entries = (
+        np.concatenate(values).astype(np.float32),
+        (np.concatenate(owners), np.concatenate(columns)),
+    )
+    return scipy.sparse.coo_array(entries, shape=(n, len(dense.ids))).tocsr(), cost, sparse
+
+
+def _near(scene: Scene, ids: NDArray[np.int64], dense: Dense) -> NDArray[np.int32]:
+    """Dense neighbours (n, MOST_NEIGHBOURS) by radius alone, and the nearest ones where the radius holds too few."""
+    p = scene.normalised_positions
+    near = radius_neighbours(p[ids], p[dense.ids], RADIUS, MOST_NEIGHBOURS).ids
+    few = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
+    if few.any():
+        near[few, :LEAST_NEIGHBOURS] = radius_neighbours(
+            p[ids[few]], p[dense.ids], np.inf, LEAST_NEIGHBOURS
+        ).ids
+    return near
+
+
+def _sampled(
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    ids: NDArray[np.int64],
+    directions: NDArray[np.int32],
+    clock: Stopwatch,
+) -> NDArray[np.float32]:
+    """White transport (n, s, channels) of vertices at their directions; 0 where there are fewer."""
+    present = directions >= 0
+    vertices, texels = np.repeat(ids, present.sum(axis=1)), directions[present]
+    with clock.phase("sparse_rays"):
+        white = direct.elements(vertices, texels)[:, None]
+    if indirect is not None:
+        with clock.phase("sparse_paths"):
+            mean = indirect.elements(vertices, texels).mean
+        white = white + mean * direct.lighting.solid_angles[texels][:, None]
+    sampled = np.zeros((*directions.shape, white.shape[1]), np.float32)
+    sampled[present] = white
+    return sampled
+
+
+def _weights(
+    stacked: NDArray[np.float32],
+    near: NDArray[np.int32],
+    directions: NDArray[np.int32],
+    sampled: NDArray[np.float32],
+    n_directions: int,
+) -> NDArray[np.float64]:
+    """L1 weights (n, k); the channels of a direction are equations of their own."""
+    channels = sampled.shape[2]
+    rows_of = [np.where(directions >= 0, directions + c * n_directions, -1) for c in range(channels)]
+    wide = np.concatenate(rows_of, axis=1).astype(np.int32)
+    values = np.concatenate([sampled[..., c] for c in range(channels)], axis=1)
+    return l1_fit(*normal_equations(stacked, near, wide, values), RELATIVE_LAMBDA).weights
+
+
+def _rates(
+    mesh: Mesh,
+    dense: Dense,
+    per_dense: NDArray[np.int64],
+    sparse: NDArray[np.int64],
+    evaluated: NDArray[np.int64],
+    n_directions: int,
+) -> dict[str, float]:
+    """Sampling rates of a mesh, as in Figure 9."""
+    own = dense.of_mesh(mesh)
+    others = (sparse >= mesh.vertices.start) & (sparse < mesh.vertices.stop)
+    n = len(own) + int(others.sum())
+    total = per_dense[own].sum() + evaluated[others].sum()
+    return {
+        "dense_vertices": len(own) / n,
+        "dense_directions": float(per_dense[own].mean()) / n_directions,
+        "sparse_directions": float(evaluated[others].mean()) / n_directions if others.any() else 0.0,
+        "elements": float(total) / (n * n_directions),
+    }

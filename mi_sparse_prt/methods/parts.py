@@ -1,0 +1,36 @@
+"""What every method returns: the parts of a matrix, and an account of what was evaluated for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from mi_sparse_prt.matrix import Indirect, Interpolated, MeanCosine, Visibility
+
+
+@dataclass
+class Parts:
+    """Parts of a matrix.
+
+    Attributes
+    ----------
+    direct, indirect : Part or None
+    elements_evaluated : int
+        Elements (vertex, direction) at which anything was evaluated, direct or indirect.
+    elements : dict
+        ``direct`` and ``indirect``: how many elements of each part were evaluated.
+    rays : dict
+        ``direct``: shadow rays; ``indirect_paths``.
+    skipped : list of str
+        Sentences.
+    sampling : dict
+        Of methods that leave elements out: per mesh, how many vertices and directions were taken.
+    """
+
+    direct: Visibility | MeanCosine | Interpolated
+    indirect: Indirect | Interpolated | None
+    elements_evaluated: int
+    elements: dict[str, int]
+    rays: dict[str, int]
+    skipped: list[str] = field(default_factory=list)
+    sampling: dict[str, Any] = field(default_factory=dict)

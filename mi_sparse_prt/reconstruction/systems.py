@@ -1,0 +1,65 @@
+"""The linear systems of sparse vertices ([HR10] eq. 5): sampled values against those of dense neighbours."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+@numba.njit(parallel=True, cache=True)
+def normal_equations(
+    rows: NDArray[np.float32],
+    neighbours: NDArray[np.int32],
+    directions: NDArray[np.int32],
+    values: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Gram form of ``A a = y`` for n vertices, A having the neighbours' rows at the sampled directions as columns.
+
+    Parameters
+    ----------
+    rows : (n_dense, n_directions) float32
+        Transport of the dense vertices.
+    neighbours : (n, k) int32
+        Rows of ``rows``; -1 where there are fewer.
+    directions : (n, s) int32
+        Sampled directions; -1 where there are fewer.
+    values : (n, s) float32
+        Sampled transport y.
+
+    Returns
+    -------
+    gram (n, k, k), correlation (n, k), squared_norm (n,)
+        A^T A, A^T y and y^T y, summed in float64; zeros for unknowns that a vertex lacks.
+    """
+    n, k = neighbours.shape
+    gram = np.zeros((n, k, k), np.float32)
+    correlation = np.zeros((n, k), np.float32)
+    squared_norm = np.zeros(n, np.float32)
+    for i in numba.prange(n):
+        system, y = _gathered(rows, neighbours[i], directions[i], values[i])
+        gram[i] = system.T @ system
+        correlation[i] = system.T @ y
+        squared_norm[i] = y @ y
+    return gram, correlation, squared_norm
+
+
+@numba.njit(cache=True)
+def _gathered(
+    rows: NDArray[np.float32],
+    neighbours: NDArray[np.int32],
+    directions: NDArray[np.int32],
+    values: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A (s, k) and y (s,) of one vertex; zeros where it has fewer directions or neighbours."""
+    system = np.zeros((len(directions), len(neighbours)))
+    y = np.zeros(len(directions))
+    for q in range(len(directions)):
+        j = directions[q]
+        if j < 0:
+            continue
+        y[q] = values[q]
+        for k in range(len(neighbours)):
+            if neighbours[k] >= 0:
+                system[q, k] = rows[neighbours[k], j]
+    return system, y

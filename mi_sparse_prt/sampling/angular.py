@@ -1,0 +1,163 @@
+"""Which directions of a densely sampled vertex are evaluated ([HR10] 4.2): a quarter first, then the features.
+
+The test for features and the borrowing of values act on the binary visibility alone. The cosine, the solid angle and
+the BRDF are applied analytically afterwards, and the horizon is not an edge: what lies below it is not compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
+from mi_sparse_prt.sampling.bits import Bits, above_horizon, listed, pack, scattered
+
+RADIUS = 3  # texels: windows of 7 x 7
+
+
+@dataclass(frozen=True)
+class DenseRows:
+    """Visibility of densely sampled vertices, each (n, ceil(n_directions / 32)) uint32 bits.
+
+    Attributes
+    ----------
+    visible : bits
+        All directions: sampled where ``evaluated``, borrowed elsewhere; 0 below the horizon.
+    evaluated : bits
+        Elements for which a ray was traced: the quarter grid above the horizon, and the features.
+    features : bits
+        Directions whose window of sampled directions is not of one kind ([HR10] Figure 3, red).
+    above : bits
+        Directions above the horizon: where ``visible`` knows anything.
+    """
+
+    visible: Bits
+    evaluated: Bits
+    features: Bits
+    above: Bits
+
+
+class AngularGrid:
+    """The quarter of a cubemap's texels that is sampled first, and the windows around all others.
+
+    Parameters
+    ----------
+    lighting : CubemapLighting
+
+    Attributes
+    ----------
+    texels : (n_grid,) int
+        Every second texel per axis, n_directions / 4 of them (all at resolution 1).
+    """
+
+    def __init__(self, lighting: CubemapLighting) -> None:
+        self.lighting = lighting
+        n = lighting.resolution
+        self._face, self._row, self._column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
+        self._sampled = (self._row % 2 == 0) & (self._column % 2 == 0)
+        self.texels = np.flatnonzero(self._sampled)
+
+    def sample(
+        self,
+        normals: NDArray[np.float32],
+        visible: Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.bool_]],
+    ) -> DenseRows:
+        """Sample rows in two passes.
+
+        Parameters
+        ----------
+        normals : (n, 3) float32
+            Of the vertices, in the frame of the lighting.
+        visible : callable
+            ``visible(rows, texels)``, both (m,): whether these vertices see the sky there, (m,) bool. Called twice.
+        """
+        above = above_horizon(normals, self.lighting.directions)
+        first = above & pack(self._sampled)
+        seen = scattered(first, visible(*listed(first)))
+        features, borrowed = _second_pass(first, seen, above, self.windows, self.lighting.n_directions)
+        seen |= borrowed | scattered(features, visible(*listed(features)))
+        return DenseRows(seen, first | features, features, above)
+
+    @cached_property
+    def windows(self) -> NDArray[np.int32]:
+        """Grid texels in the window around every texel, (n_directions, at most 16), -1 where there are fewer.
+
+        Windows continue across the edges of the cube on the plane of the texel's own face.
+        """
+        columns = []
+        for dy in range(-RADIUS, RADIUS + 1):
+            for dx in range(-RADIUS, RADIUS + 1):
+                texels, inside = self._shifted(dx, dy)
+                columns.append(np.where(self._sampled[texels] & inside, texels, -1))
+        table = np.sort(np.stack(columns, axis=1), axis=1)[:, ::-1]  # [texel, place], -1 last
+        table[:, 1:][table[:, 1:] == table[:, :-1]] = -1  # beyond an edge two places can meet one texel
+        table = np.sort(table, axis=1)[:, ::-1]
+        return np.ascontiguousarray(table[:, : max(1, int((table >= 0).sum(axis=1).max()))], dtype=np.int32)
+
+    @cached_property
+    def upsampling(self) -> scipy.sparse.csr_array:
+        """Bilinear interpolation of values at ``texels`` to all directions, (n_directions, n_grid), rows sum to 1.
+
+        Inside of a face it is exact for linear functions of the face coordinates; near an edge the tent reaches the
+        grid texels of the next face.
+        """
+        index = np.full(self.lighting.n_directions, -1)
+        index[self.texels] = np.arange(len(self.texels))
+        rows, columns, weights = [], [], []
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                texels, inside = self._shifted(dx, dy)
+                good = np.flatnonzero(self._sampled[texels] & inside)
+                rows.append(good)
+                columns.append(index[texels[good]])
+                weights.append(np.full(len(good), (1 - abs(dx) / 2) * (1 - abs(dy) / 2)))
+        entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+        matrix = scipy.sparse.coo_array(entries, shape=(self.lighting.n_directions, len(self.texels))).tocsr()
+        total = matrix.sum(axis=1)
+        return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / total) @ matrix, dtype=np.float32)
+
+    def _shifted(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The texel (dx, dy) beside each texel, and whether it is not beyond two edges at once."""
+        n = self.lighting.resolution
+        s, t = (2 * (self._column + dx) + 1) / n - 1, (2 * (self._row + dy) + 1) / n - 1
+        s_axis, t_axis, centre = (FACE_FRAMES[self._face, axis] for axis in range(3))
+        texels = self.lighting.texel_of(centre + s[:, None] * s_axis + t[:, None] * t_axis)
+        return texels.astype(np.int64), ~((np.abs(s) > 1) & (np.abs(t) > 1))
+
+
+@numba.njit(parallel=True, cache=True)
+def _second_pass(
+    first: Bits, seen: Bits, above: Bits, windows: NDArray[np.int32], n_directions: int
+) -> tuple[Bits, Bits]:
+    """Features (to be sampled) and borrowed visibility of the directions that the first pass left out.
+
+    A window with no sampled direction above the horizon says nothing: its direction is sampled as well.
+    """
+    features, borrowed = np.zeros_like(first), np.zeros_like(first)
+    one = np.uint32(1)
+    for i in numba.prange(len(first)):
+        for j in range(n_directions):
+            word, bit = j >> 5, np.uint32(j & 31)
+            if not (above[i, word] >> bit) & one or (first[i, word] >> bit) & one:
+                continue
+            lit, dark = False, False
+            for k in range(windows.shape[1]):
+                g = windows[j, k]
+                if g < 0:
+                    break
+                if (first[i, g >> 5] >> np.uint32(g & 31)) & one:
+                    if (seen[i, g >> 5] >> np.uint32(g & 31)) & one:
+                        lit = True
+                    else:
+                        dark = True
+            if lit == dark:
+                features[i, word] |= one << bit
+            elif lit:
+                borrowed[i, word] |= one << bit
+    return features, borrowed
