@@ -138,10 +138,10 @@ def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {"albedo": transport.albedo, "vertex_keys": transport.vertex_keys}
     direct, indirect = transport.direct, transport.indirect
     if isinstance(direct, Interpolated):
-        arrays |= _sparse_arrays("direct_weights", direct.weights)
+        arrays |= _sparse_arrays("weights_direct", direct.weights)
         direct = direct.dense  # type: ignore[assignment]
     if isinstance(indirect, Interpolated):
-        arrays |= _sparse_arrays("indirect_weights", indirect.weights)
+        arrays |= _sparse_arrays("weights_indirect", indirect.weights)
         indirect = indirect.dense  # type: ignore[assignment]
     if isinstance(direct, Visibility):
         arrays |= {"visibility": direct.bits, "normals": direct.normals}
@@ -174,16 +174,16 @@ def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Li
     direct: Visibility | MeanCosine | Interpolated
     if attributes["basis"] == "direction":
         direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
-        if "direct_weights_data" in arrays:
-            direct = Interpolated(direct, _sparse_matrix("direct_weights", arrays, len(direct.bits)))
+        if "weights_direct_data" in arrays:
+            direct = Interpolated(direct, _sparse_matrix("weights_direct", arrays, len(direct.bits)))
     else:
         direct = MeanCosine(arrays["mean_cosine"], lighting)
     indirect: Indirect | Interpolated | None = None
     if attributes["indirect"]:
         density = arrays["indirect"]
         indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
-        if "indirect_weights_data" in arrays:
-            indirect = Interpolated(indirect, _sparse_matrix("indirect_weights", arrays, len(density)))
+        if "weights_indirect_data" in arrays:
+            indirect = Interpolated(indirect, _sparse_matrix("weights_indirect", arrays, len(density)))
     return LightTransport(
         lighting=lighting,
         basis=attributes["basis"],
@@ -201,8 +201,8 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
     """All arrays are of the same vertices and of the file's lighting."""
     n, m = len(arrays["albedo"]), lighting.n_directions
     # an interpolated part has fewer rows than the matrix, and weights with a row for each vertex
-    n_direct = len(arrays["normals"]) if "direct_weights_indptr" in arrays else n
-    n_indirect = len(arrays["indirect"]) if "indirect_weights_indptr" in arrays else n
+    n_direct = len(arrays["normals"]) if "weights_direct_indptr" in arrays else n
+    n_indirect = len(arrays["indirect"]) if "weights_indirect_indptr" in arrays else n
     expected = {
         "albedo": (n, 3),
         "vertex_keys": (n,),
@@ -211,8 +211,8 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
         "mean_cosine": (n, m),
         "indirect": (n_indirect, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
         "upsampling_indptr": (m + 1,),
-        "direct_weights_indptr": (n + 1,),
-        "indirect_weights_indptr": (n + 1,),
+        "weights_direct_indptr": (n + 1,),
+        "weights_indirect_indptr": (n + 1,),
     }
     for name, shape in expected.items():
         if name in arrays and arrays[name].shape != shape:

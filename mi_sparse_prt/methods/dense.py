@@ -106,7 +106,7 @@ def indirect_of(
     name: str,
     progress: bool,
 ) -> Estimate:
-    """Indirect light of every given vertex at every given texel: mean and variance (k, t, channels), vertex by vertex."""
+    """Indirect light of all given vertices at all given texels: mean and variance (k, t, channels)."""
     shape = (len(vertices), len(texels), solver.channels)
     mean, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
     block = max(1, solver.block_elements // max(1, len(texels)))

@@ -1,4 +1,4 @@
-"""``method="huang2010"``: sparse precomputation as published ([HR10] sections 4 and 5), nothing added, nothing left out.
+"""``method="huang2010"``: sparse precomputation as published ([HR10] sections 4 and 5), nothing added or left out.
 
 Dense vertices: a quarter of the directions, and the features; indirect light on the quarter grid. Sparse vertices: the
 350 best directions, direct and indirect light together; weights of all dense vertices within a radius by L1

@@ -23,7 +23,7 @@ from mi_sparse_prt.matrix import Indirect, Interpolated, Visibility
 from mi_sparse_prt.methods.dense import Dense, DenseSampler, indirect_of
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.reconstruction.low_rank import denoised
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, inverse_distance_weights, surface_neighbours
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.bits import Bits, above_horizon, counts, listed, pack, scattered
 from mi_sparse_prt.sampling.features import contested
@@ -31,7 +31,7 @@ from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
-DENSE = 0.12  # of the vertices of a mesh
+DENSE = 0.17  # of the vertices of a mesh
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 NEIGHBOURS = 12
 LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
@@ -81,19 +81,23 @@ def sparse_parts(
     if indirect is not None:
         density = _indirect_rows(scene, indirect, dense, grid, clock, progress)
         with clock.phase("solver"):
-            weights = _weights(groups, dense, len(scene.positions))
+            weights = _weights(scene, groups, dense)
         part = Interpolated(Indirect(density, grid.upsampling, direct.lighting), weights)
     return _account(scene, direct, indirect, dense, grid, state, part)
 
 
 @dataclass
 class _Neighbourhood:
-    """Sparse vertices (n,) of a mesh, all its vertices, and the dense neighbours of each: (n, k) indices into Dense."""
+    """The sparse vertices (n_sparse,) of a mesh, and dense neighbours of all its vertices: indices into Dense."""
 
     mesh: Mesh
     sparse: NDArray[np.int64]
     near: Neighbours
-    weights: NDArray[np.float32]
+
+    @property
+    def near_sparse(self) -> NDArray[np.int32]:
+        """Neighbours (n_sparse, k) of the sparse vertices."""
+        return self.near.ids[self.sparse - self.mesh.vertices.start]
 
 
 def _neighbourhoods(
@@ -103,7 +107,7 @@ def _neighbourhoods(
     dense = sampler.dense()
     with clock.phase("neighbours"):
         groups = [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
-        few = [g.sparse[(g.near.ids >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]
+        few = [g.sparse[(g.near_sparse >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]
     lonely = np.concatenate(few)
     if not len(lonely):
         return dense, groups
@@ -114,13 +118,13 @@ def _neighbourhoods(
 
 
 def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> _Neighbourhood:
-    chosen = dense.of_mesh(mesh)
+    chosen, inside = dense.of_mesh(mesh), mesh.vertices
     own = dense.ids[chosen]
-    sparse = np.setdiff1d(np.arange(mesh.vertices.start, mesh.vertices.stop), own)
+    sparse = np.setdiff1d(np.arange(inside.start, inside.stop), own)
     p, n = scene.normalised_positions, scene.normals
-    near = surface_neighbours(p[sparse], n[sparse], p[own], n[own], NEIGHBOURS)
+    near = surface_neighbours(p[inside], n[inside], p[own], n[own], NEIGHBOURS)
     ids = np.where(near.ids >= 0, chosen[near.ids], -1).astype(np.int32)
-    return _Neighbourhood(mesh, sparse, Neighbours(ids, near.distances), inverse_distance_weights(near))
+    return _Neighbourhood(mesh, sparse, Neighbours(ids, near.distances))
 
 
 class _Visibility:
@@ -144,7 +148,7 @@ class _Visibility:
         """Rows of sparse vertices: what their neighbours agree on, and traced rays elsewhere."""
         rows = self._dense.rows
         with self._clock.phase("consensus"):
-            differ, agreed = contested(group.near.ids, rows.visible, rows.above, self.above[group.sparse])
+            differ, agreed = contested(group.near_sparse, rows.visible, rows.above, self.above[group.sparse])
             self.visible[group.sparse] = agreed
             self._trace(group.sparse, differ)
 
@@ -229,17 +233,19 @@ def _indirect_rows(
     return density
 
 
-def _weights(groups: list[_Neighbourhood], dense: Dense, n: int) -> scipy.sparse.csr_array:
-    """A (n, n_dense): inverse-distance weights of the sparse vertices, 1 for each dense one itself."""
-    rows, columns = [dense.ids], [np.arange(len(dense.ids))]
-    values = [np.ones(len(dense.ids), np.float32)]
+def _weights(scene: Scene, groups: list[_Neighbourhood], dense: Dense) -> scipy.sparse.csr_array:
+    """A (n_v, n_dense): dense rows take part in their own smoothing, with their neighbours'."""
+    p, n = scene.normalised_positions, scene.normals
+    rows, columns, values = [], [], []
     for group in groups:
-        present = group.near.ids >= 0
-        rows.append(np.repeat(group.sparse, present.sum(axis=1)))
-        columns.append(group.near.ids[present].astype(np.int64))
-        values.append(group.weights[present])
+        inside, ids = group.mesh.vertices, group.near.ids
+        weights = linear_weights(group.near, p[inside], n[inside], p[dense.ids], n[dense.ids])
+        present = ids >= 0
+        rows.append(np.repeat(np.arange(inside.start, inside.stop), present.sum(axis=1)))
+        columns.append(ids[present].astype(np.int64))
+        values.append(weights[present])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return scipy.sparse.coo_array(entries, shape=(n, len(dense.ids))).tocsr()
+    return scipy.sparse.coo_array(entries, shape=(len(p), len(dense.ids))).tocsr()
 
 
 def _account(

@@ -1,557 +1,468 @@
-"""Sparse weights for many small systems at once: min_a ||A a - y||^2 + lambda ||a||_1 ([HR10] 5.1, [KKL*07]).
+"""Weights of a vertex's neighbours from a few samples: many small l1-regularised least-squares problems ([HR10] 5.1).
 
-A problem comes as ``G = A^T A``, ``r = A^T y`` and ``s = ||y||^2``, which is all that the solvers need. Inside, columns
-and right-hand side have unit length, so that units do not matter; there the objective is
+Each problem is ``min_a ||A a - y||^2 + lambda ||a||_1`` as in [KKL07] (no 1/2 before the square), known by its Gram
+matrix. Inside, every problem is one of columns and y of unit length, so that neither the units of A and y nor a
+column much longer than the others matter; the penalty then differs from unknown to unknown.
 
-    ``b^T G b - 2 b^T r + 1 + 2 sum_i l_i |b_i|``,    with ``q = r - G b`` as minus half its smooth gradient.
-
-[KKL*07]: Kim, Koh, Lustig, Boyd, Gorinevsky, "An interior-point method for large-scale l1-regularized least squares",
-IEEE J. Sel. Top. Signal Process. 1(4), 2007. Note that its squared norm has no factor 1/2.
+[HR10] Huang, Ramamoorthi: Sparsely Precomputing the Light Transport Matrix for Real-Time Rendering, 2010.
+[KKL07] Kim, Koh, Lustig, Boyd, Gorinevsky: An Interior-Point Method for Large-Scale l1-Regularized Least Squares, 2007.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numba
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.errors import PrtError
 
-Array = NDArray[np.float64]
-Solver = Literal["coordinate_descent", "interior_point"]
+Floats = NDArray[np.float64]
 
-SWEEPS_PER_ROUND = 2  # of coordinate descent, before Newton steps
-MAX_ROUNDS = 400  # a bound for hopeless systems; ordinary ones need two or three
-NEVER = 1.001  # unit columns meet a unit residual in at most 1: with l_i above, weight i is 0 (0.001: rounded input)
-SMALLEST_PIVOT = 1e-10  # of unit columns: below, a column counts as repeated
-SETTLED = 1e-14  # the largest change in a sweep that is only rounding
-
-BARRIER_GROWTH = 2.0  # mu of [KKL*07] 4.1, as are the three below
-LONG_STEP = 0.5
-SUFFICIENT_DECREASE = 0.01
-BACKTRACKING = 0.5
-MAX_NEWTON_STEPS = 400
+SOLVERS = ("coordinate_descent", "interior_point")
+MAX_STEPS = 1000  # of coordinate descent; about one per unknown is usual
+MAX_NEWTON_STEPS, MAX_BACKTRACKS = 400, 100  # as in the authors' l1_ls.m
+DAMPING = 1e-14  # of a unit diagonal: columns equal but for rounding move together instead of far apart
+SMALLEST = np.finfo(np.float64).tiny
+LONGEST = np.finfo(np.float64).eps ** -0.5  # singular values below sqrt(eps) are lost in a Gram matrix
+BLOCK = 4096  # eigendecompositions at a time
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Solutions of m problems with up to k unknowns.
+    """Solutions of m problems of k unknowns.
 
     Attributes
     ----------
     weights : (m, k) float64
-        a; exactly 0 where the system has an empty column.
+        Exactly 0 where the column of A is 0.
     objective : (m,) float64
-        The function that was minimised, at ``weights``.
+        What was minimised, at the weights.
     gap : (m,) float64
-        No weights have an objective below ``objective - gap``. Without a penalty (lambda = 0) no better bound than
-        0 is at hand and the gap is the objective itself; a closed form has gap 0.
+        Duality gap: the objective is at most so much above its minimum. Without a penalty no better bound than the
+        objective itself is at hand (`l1_fit`), or the closed form makes it 0 (`least_squares_fit`).
     iterations : (m,) int64
-        Sweeps of coordinate descent, or Newton steps; 0 where 0 was already the answer, or for a closed form.
+        Coordinates visited, or Newton steps.
     """
 
-    weights: Array
-    objective: Array
-    gap: Array
+    weights: Floats
+    objective: Floats
+    gap: Floats
     iterations: NDArray[np.int64]
 
 
 def l1_fit(
-    gram: NDArray[np.floating],
-    correlation: NDArray[np.floating],
-    squared_norm: NDArray[np.floating],
+    gram: ArrayLike,
+    correlation: ArrayLike,
+    squared_norm: ArrayLike,
     relative_lambda: float = 1e-2,
-    solver: Solver = "coordinate_descent",
+    solver: str = "coordinate_descent",
     tolerance: float = 1e-6,
     non_negative: bool = False,
 ) -> Fit:
-    """Minimise ``||A a - y||^2 + lambda ||a||_1`` for every problem, with lambda relative to its own lambda_max.
+    """Minimise ``||A a - y||^2 + lambda ||a||_1`` for many small problems ([HR10] 5.1, [KKL07]).
 
-    A problem's answer depends on nothing but the problem: not on its neighbours in the batch, nor on threads.
+    A problem's result depends neither on the others, nor on the number of threads.
 
     Parameters
     ----------
     gram : (m, k, k) float32 or float64
-        A^T A. Unknowns that a problem lacks are rows and columns of zeros.
+        ``A^T A``. Problems of fewer unknowns are padded with rows and columns of zeros, whose weights are 0. A float32
+        matrix counts as known to its precision: its diagonal is raised by k roundings, so that it is definite.
     correlation : (m, k)
-        A^T y.
+        ``A^T y``.
     squared_norm : (m,)
-        ||y||^2.
+        ``||y||^2``.
     relative_lambda : float
-        lambda / lambda_max, where ``lambda_max = max |2 A^T y|`` is the smallest lambda with all weights 0.
-        From 1 on all weights are 0; at 0 this is least squares, stopped once no residual correlation is above
-        ``tolerance`` (an unpenalised system has no gap to stop by).
-    solver : "coordinate_descent" or "interior_point"
-        The first is fast, compiled and parallel; its zeros are exact. The second is [KKL*07] one problem at a time,
-        a reference, and needs a positive lambda.
+        lambda in units of ``||2 A^T y||_inf``, from which on all weights are 0. At 0 it is plain least squares, by the
+        steps that the penalised problem takes, ended when no unit column correlates with the residual by more than
+        ``tolerance ||y||``.
+    solver : {"coordinate_descent", "interior_point"}
+        The first moves the steepest coordinate, then all that are not 0 to their common minimum; exactly sparse. The
+        second is [KKL07] with direct Newton steps: the reference, hundreds of times slower, nothing exactly 0.
     tolerance : float
-        Stop when the duality gap is at most ``tolerance * squared_norm``.
+        A problem is solved when its duality gap is at most ``tolerance ||y||^2``. Where rounding stops the descent
+        before (columns all but equal, tiny lambda) or 1000 steps do, `Fit.gap` says what was reached.
     non_negative : bool
-        Only weights >= 0 (coordinate descent).
+        Weights >= 0, by coordinate descent.
 
     Returns
     -------
     Fit
-        A gap above the tolerance tells where iterations ran out, which takes a system singular to working precision.
 
     Raises
     ------
     PrtError
-        If shapes do not fit, a parameter is out of range, or a problem (named) is not finite or no Gram matrix.
+        For shapes that do not match, values that are not finite (naming the problem), or options out of range.
     """
-    _check_parameter("relative_lambda", relative_lambda, relative_lambda >= 0, "at least 0")
-    _check_parameter("tolerance", tolerance, tolerance > 0, "above 0")
-    if solver not in ("coordinate_descent", "interior_point"):
-        raise PrtError(f"solver is {solver!r}: choose 'coordinate_descent' or 'interior_point'")
+    products = _checked(gram, correlation, squared_norm)
+    if solver not in SOLVERS:
+        raise PrtError(f"solver {solver!r} is unknown; choose one of {', '.join(SOLVERS)}")
+    _check_option("relative_lambda", relative_lambda, relative_lambda >= 0, "0 or more")
+    _check_option("tolerance", tolerance, tolerance > 0, "more than 0")
     if solver == "interior_point" and (non_negative or relative_lambda == 0):
-        what = "non_negative=True" if non_negative else "relative_lambda=0"
-        raise PrtError(f"interior_point cannot solve with {what}: use solver='coordinate_descent'")
-    G, r, s = _checked(gram, correlation, squared_norm)
-    relative_lambda, tolerance = (
-        float(relative_lambda),
-        float(tolerance),
-    )  # an int would be compiled for once more
-    if solver == "interior_point":
-        return _interior_point_each(G, r, s, relative_lambda, tolerance)
-    return Fit(*_descend_each(G, r, s, relative_lambda, tolerance, bool(non_negative)))
+        unable = "non_negative=True" if non_negative else "relative_lambda=0"
+        raise PrtError(f"interior_point cannot solve with {unable}; use solver='coordinate_descent'")
+    run = _all_by_descent if solver == "coordinate_descent" else _all_by_interior_point
+    return Fit(*run(*products, float(relative_lambda), float(tolerance), bool(non_negative)))
 
 
 def least_squares_fit(
-    gram: NDArray[np.floating],
-    correlation: NDArray[np.floating],
-    squared_norm: NDArray[np.floating],
-    relative_ridge: float = 0.0,
+    gram: ArrayLike, correlation: ArrayLike, squared_norm: ArrayLike, relative_ridge: float = 0.0
 ) -> Fit:
-    """Minimise ``||A a - y||^2 + ridge ||a||^2``; of several answers, take the shortest a.
-
-    Eigenvalues of G up to ``k * eps`` times the largest (eps of the type of ``gram``) are rounding and count as 0.
+    """Minimise ``||A a - y||^2 + ridge ||a||^2``, by the shortest a where several do.
 
     Parameters
     ----------
-    gram, correlation, squared_norm
-        As in `l1_fit`.
+    gram, correlation, squared_norm : (m, k, k), (m, k), (m,)
+        As for `l1_fit`.
     relative_ridge : float
-        ridge / mean of the diagonal of G, empty columns left out.
+        Ridge in units of the mean of the Gram matrix's diagonal, over unknowns whose column is not 0.
 
     Returns
     -------
     Fit
-        In closed form: gap and iterations are 0. The objective includes the ridge.
+        Eigenvectors whose eigenvalue (plus ridge) is at most k eps times the largest (eps of the Gram matrix's type)
+        carry no weight: columns shorter than sqrt(k eps) of the longest, or closer to each other, are lost in noise.
+        The objective includes the ridge; ``gap`` and ``iterations`` are 0.
 
     Raises
     ------
     PrtError
-        As in `l1_fit`.
+        For shapes that do not match, values that are not finite (naming the problem), or a negative ridge.
     """
-    _check_parameter("relative_ridge", relative_ridge, relative_ridge >= 0, "at least 0")
-    G, r, s = _checked(gram, correlation, squared_norm)
+    G, r, s, eps = _checked(gram, correlation, squared_norm)
+    _check_option("relative_ridge", relative_ridge, relative_ridge >= 0, "0 or more")
     m, k = r.shape
-    if m == 0 or k == 0:
-        return Fit(np.zeros((m, k)), s.copy(), np.zeros(m), np.zeros(m, dtype=np.int64))
-    diagonal = np.einsum("mii->mi", G).astype(np.float64)  # [problem, unknown]
-    used = diagonal > 0
-    unit = np.where(used.any(axis=1), diagonal.max(axis=1), 1.0)  # of G: no under- or overflow below
-    ridge = relative_ridge * (diagonal / unit[:, None]).sum(axis=1) / np.maximum(used.sum(axis=1), 1)
-
-    # [problem, value] and [problem, unknown, value]
-    values, vectors = np.linalg.eigh(G / unit[:, None, None].astype(G.dtype))
-    values, vectors = values.astype(np.float64), vectors.astype(np.float64)
-    kept = values > k * np.finfo(G.dtype).eps * values[:, -1:]
-    inverse = np.divide(1.0, values + ridge[:, None], out=np.zeros_like(values), where=kept)
-    right = np.where(used, r / unit[:, None], 0.0)  # [problem, unknown]
-    weights = np.einsum("mij,mj->mi", vectors, inverse * np.einsum("mij,mi->mj", vectors, right))
-    weights = np.where(used, weights, 0.0)
-
-    squared_error = _squared_error(G, r, s, weights)
-    objective = squared_error + ridge * unit * (weights**2).sum(axis=1)
+    weights, objective = np.zeros((m, k)), s.copy()
+    for a in range(0, m if k else 0, BLOCK):
+        part = slice(a, a + BLOCK)
+        weights[part], objective[part] = _by_eigenvectors(
+            G[part].astype(np.float64), r[part], s[part], relative_ridge, k * eps
+        )
     return Fit(weights, objective, np.zeros(m), np.zeros(m, dtype=np.int64))
 
 
-def _squared_error(gram: NDArray, correlation: Array, squared_norm: Array, weights: Array) -> Array:
-    """||A a - y||^2 (m,), which rounding must not take below 0."""
-    quadratic = (weights * np.matmul(gram, weights[..., None])[..., 0]).sum(axis=1)
-    return np.maximum(quadratic - 2 * (weights * correlation).sum(axis=1) + squared_norm, 0.0)
+def _check_option(name: str, value: float, valid: bool, wanted: str) -> None:
+    if not (valid and np.isfinite(value)):
+        raise PrtError(f"{name} is {value}; pass a finite number, {wanted}")
 
 
-# --- What both iterative solvers share -------------------------------------------------------------------------------
+def _checked(
+    gram: ArrayLike, correlation: ArrayLike, squared_norm: ArrayLike
+) -> tuple[NDArray, Floats, Floats, float]:
+    """The products as arrays that compiled code takes, and the rounding of the Gram matrix."""
+    G = np.asarray(gram)
+    G = np.ascontiguousarray(G, dtype=np.float32 if G.dtype == np.float32 else np.float64)
+    r = np.array(correlation, dtype=np.float64, order="C", ndmin=1)
+    s = np.array(squared_norm, dtype=np.float64, order="C", ndmin=1)
+    if r.ndim != 2 or G.shape != (*r.shape, r.shape[1]) or s.shape != r.shape[:1]:
+        raise PrtError(
+            f"gram {G.shape}, correlation {r.shape}, squared_norm {s.shape} do not match; pass (m, k, k), (m, k), (m,)"
+        )
+    fine = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(r).all(axis=1) & np.isfinite(s) & (s >= 0)
+    if not fine.all():
+        raise PrtError(
+            f"problem {np.argmin(fine)} of {len(fine)} is not finite, or has a squared_norm < 0; check its samples"
+        )
+    return G, r, s, float(np.finfo(G.dtype).eps)
+
+
+# -- the problem in units of its own ----------------------------------------------------------------------------------
 
 
 @numba.njit(cache=True)
-def _normalise(
-    gram: NDArray[np.floating], correlation: Array, squared_norm: float, relative_lambda: float
-) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
-    """One problem with unit columns and unit y, without the unknowns that must be 0.
-
-    Returns ids (n,), G (n, n), r (n,), the penalties l (n,) and ``length`` (n,): a[ids] = b * length. Leaving columns
-    out makes the answer independent of padding.
+def _normalised(
+    G: NDArray, r: Floats, s: float, eps: float, relative_lambda: float
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats, Floats]:
+    """Ids (n,) of the unknowns that have a column (none where y is 0), Gram matrix (n, n) and correlations (n,) of unit
+    columns and y, half the penalties (n,), and which weight (n,) a unit of each unknown is.
     """
-    k = len(correlation)
-    largest = 0.0  # of |A^T y|
-    for i in range(k):
-        if gram[i, i] > 0:
-            largest = max(largest, abs(correlation[i]))
-    y_norm = np.sqrt(squared_norm)
-    ids = np.empty(k, dtype=np.int64)
+    used = np.empty(len(r), dtype=np.int64)
     n = 0
-    if y_norm > 0:
-        for i in range(k):
-            # A weight that stays 0 only costs time, and a huge penalty on it would cost digits too.
-            if (
-                gram[i, i] > 0
-                and relative_lambda * largest <= NEVER * np.sqrt(np.float64(gram[i, i])) * y_norm
-            ):
-                ids[n] = i
-                n += 1
-    G, r, penalty, inverse = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
-    for i in range(n):
-        inverse[i] = 1.0 / np.sqrt(np.float64(gram[ids[i], ids[i]]))
-    for i in range(n):
-        r[i] = correlation[ids[i]] * inverse[i] / y_norm
-        penalty[i] = (
-            relative_lambda * largest * inverse[i] / y_norm
-        )  # rounds as r does: r <= l if lambda >= lambda_max
-        for j in range(n):
-            G[i, j] = np.float64(gram[ids[i], ids[j]]) * inverse[i] * inverse[j]
-    return ids[:n], G, r, penalty, inverse * y_norm
+    for i in range(len(r)):
+        if s >= SMALLEST and G[i, i] >= SMALLEST:
+            used[n] = i
+            n += 1
+    used = used[:n]
+    g, c, half, unit = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
+    root, largest = np.sqrt(s), 0.0
+    for a in range(n):
+        unit[a] = 1 / np.sqrt(np.float64(G[used[a], used[a]]))
+        largest = max(largest, abs(r[used[a]]))
+    for a in range(n):
+        c[a] = r[used[a]] * unit[a] / root
+        half[a] = relative_lambda * largest * unit[a] / root
+        for b in range(n):
+            g[a, b] = G[used[a], used[b]] * unit[a] * unit[b]
+        g[a, a] = 1 + n * eps  # correlations that were rounded may be indefinite by as much
+    return used, g, c, half, unit * root
 
 
 @numba.njit(cache=True)
-def _primal_and_dual(r: Array, q: Array, b: Array, penalty: Array, non_negative: bool) -> tuple[float, float]:
-    """The objective at b, and a lower bound of all objectives ([KKL*07] 3.2).
-
-    The bound is the dual function at the residual ``nu = 2 theta (A b - y)``, where theta <= 1 makes nu feasible:
-    ``-nu^T nu / 4 - nu^T y``. Weights that cannot be negative only bound correlations from above.
-    """
-    along_y, with_residual, l1, theta = 0.0, 0.0, 0.0, 1.0
+def _objective_and_gap(
+    b: Floats, c: Floats, q: Floats, half: Floats, non_negative: bool
+) -> tuple[float, float]:
+    """Of weights b, where q = c - g b correlates columns and residual: [KKL07] III, nu = 2 theta (A b - y)."""
+    bc, bq, penalty, theta = 0.0, 0.0, 0.0, 1.0
     for i in range(len(b)):
-        along_y += b[i] * r[i]
-        with_residual += b[i] * q[i]
-        l1 += 2.0 * penalty[i] * abs(b[i])
-        excess = q[i] if non_negative else abs(q[i])
-        if excess > penalty[i]:
-            theta = min(theta, penalty[i] / excess)
-    squared_error = max(1.0 - along_y - with_residual, 0.0)
-    return squared_error + l1, 2.0 * theta * (1.0 - along_y) - theta * theta * squared_error
+        if b[i] != 0:
+            bc += b[i] * c[i]
+            bq += b[i] * q[i]
+            penalty += 2 * half[i] * abs(b[i])
+        steep = q[i] if non_negative else abs(q[i])
+        if steep > half[i]:
+            theta = min(theta, half[i] / steep)
+    residual = max(1 - bc - bq, 0.0)  # rounding may take it below 0
+    dual = 2 * theta * (1 - bc) - theta * theta * residual
+    return residual + penalty, max(residual + penalty - dual, 0.0)
 
 
-# --- Coordinate descent ----------------------------------------------------------------------------------------------
+# -- coordinate descent -----------------------------------------------------------------------------------------------
 
 
-@numba.njit(
-    parallel=True, cache=True
-)  # no fastmath: sums keep their order, and what is not finite stays visible
-def _descend_each(
-    gram: NDArray[np.floating],
-    correlation: Array,
-    squared_norm: Array,
+@numba.njit(parallel=True, cache=True)  # no fastmath: sums keep their order, on any number of threads
+def _all_by_descent(
+    G: NDArray,
+    r: Floats,
+    s: Floats,
+    eps: float,
     relative_lambda: float,
     tolerance: float,
     non_negative: bool,
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Weights (m, k), objectives (m,), gaps (m,) and sweeps (m,) of all problems, one problem per thread at a time."""
-    m, k = correlation.shape
-    weights, objective, gap = np.zeros((m, k)), np.empty(m), np.empty(m)
-    sweeps = np.zeros(m, dtype=np.int64)
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    m, k = r.shape
+    weights, objective, gap = np.zeros((m, k)), np.zeros(m), np.zeros(m)
+    iterations = np.zeros(m, dtype=np.int64)
     for p in numba.prange(m):
-        s = squared_norm[p]
-        ids, G, r, penalty, length = _normalise(gram[p], correlation[p], s, relative_lambda)
-        b, primal, dual, sweeps[p] = _descend(G, r, penalty, tolerance, non_negative)
-        objective[p], gap[p] = s * primal, s * max(primal - dual, 0.0)
-        for i in range(len(ids)):
-            weights[p, ids[i]] = b[i] * length[i]
-    return weights, objective, gap, sweeps
+        used, g, c, half, unit = _normalised(G[p], r[p], s[p], eps, relative_lambda)
+        b = np.zeros(len(used))
+        least, above, iterations[p] = _descend(g, c, half, b, relative_lambda > 0, non_negative, tolerance)
+        objective[p], gap[p] = least * s[p], above * s[p]
+        for a in range(len(used)):
+            weights[p, used[a]] = b[a] * unit[a]
+    return weights, objective, gap, iterations
 
 
 @numba.njit(cache=True)
 def _descend(
-    G: Array, r: Array, penalty: Array, tolerance: float, non_negative: bool
-) -> tuple[Array, float, float, int]:
-    """One normalised problem: weights, objective, its lower bound, sweeps.
+    g: Floats, c: Floats, half: Floats, b: Floats, penalised: bool, non_negative: bool, tolerance: float
+) -> tuple[float, float, int]:
+    """Move b from 0 to the minimum; objective, gap, steps.
 
-    Sweeps soon know which weights are 0 and the signs of the others, but crawl where columns are much alike (hundreds
-    of sweeps at a correlation of 0.9). With signs known the rest is a linear system, which `_newton` solves. Neither
-    ever increases the objective.
+    Cyclic descent needs hundreds of sweeps for columns as alike as neighbours' visibility. One coordinate at a time,
+    each followed by the exact minimum over all that are not 0, takes about as many steps as weights remain.
     """
-    n = len(r)
-    b, q = np.zeros(n), r.copy()
-    unpenalised = n > 0 and penalty.max() == 0.0
-    primal, dual = _primal_and_dual(r, q, b, penalty, non_negative)
-    change = np.inf
-    for done in range(MAX_ROUNDS):
-        if unpenalised:
-            finished = _steepest(q, b, non_negative) <= tolerance
+    q = c.copy()  # correlation of columns and residual: minus half the gradient of the square
+    order = np.empty(len(b), dtype=np.int64)  # unknowns that are not 0, as they came
+    factor, target = np.empty_like(g), np.empty_like(b)
+    active, factored, least = 0, 0, np.inf
+    for step in range(MAX_STEPS):
+        objective, gap = _objective_and_gap(b, c, q, half, non_negative)
+        steepest, slope = _steepest(b, q, half, non_negative)
+        if gap <= tolerance or objective >= least or (not penalised and slope <= tolerance):
+            return objective, gap, step
+        least = objective
+
+        if steepest >= 0:
+            b[steepest] = np.copysign(abs(q[steepest]) - half[steepest], q[steepest])
+            order[active] = steepest
+            active += 1
+
+        arrived = False
+        while active > 0 and not arrived:
+            _factor(g, order, factored, active, factor)
+            _face_minimum(c, half, b, order, active, factor, target)
+            active, factored, arrived = _move(b, target, order, active, penalised or non_negative)
+        _keep_bounded(b, half)
+
+        q[:] = c
+        for a in range(active):
+            q -= b[order[a]] * g[order[a]]
+    objective, gap = _objective_and_gap(b, c, q, half, non_negative)
+    return objective, gap, MAX_STEPS
+
+
+@numba.njit(cache=True)
+def _steepest(b: Floats, q: Floats, half: Floats, non_negative: bool) -> tuple[int, float]:
+    """The zero weight (or -1) along which the objective falls fastest, and half the largest slope of all weights."""
+    steepest, fall, slope = -1, 0.0, 0.0
+    for i in range(len(b)):
+        if b[i] != 0:
+            slope = max(slope, abs(q[i] - np.copysign(half[i], b[i])))
         else:
-            finished = primal - dual <= tolerance
-        if finished or change <= SETTLED:
-            return b, primal, dual, done * SWEEPS_PER_ROUND
-        for _ in range(SWEEPS_PER_ROUND):
-            change = _sweep(G, q, b, penalty, non_negative)
-        while _newton(G, q, b, penalty):  # each time fewer weights are left
-            pass
-        _refresh(G, r, b, q)
-        primal, bound = _primal_and_dual(r, q, b, penalty, non_negative)
-        dual = max(dual, bound)
-    return b, primal, dual, MAX_ROUNDS * SWEEPS_PER_ROUND
+            here = (q[i] if non_negative else abs(q[i])) - half[i]
+            if here > fall:
+                steepest, fall = i, here
+    return steepest, max(slope, fall)
 
 
 @numba.njit(cache=True)
-def _sweep(G: Array, q: Array, b: Array, penalty: Array, non_negative: bool) -> float:
-    """Minimise over each weight in turn, in place; the largest change."""
-    largest = 0.0
-    for i in range(len(b)):
-        z = q[i] + b[i]
-        size = max((z if non_negative else abs(z)) - penalty[i], 0.0)
-        change = (size if z > 0 else -size) - b[i]
-        if change != 0.0:
-            b[i] += change
-            if size == 0.0:
-                b[i] = 0.0
-            largest = max(largest, abs(change))
-            row = G[i]
-            for j in range(len(b)):
-                q[j] -= change * row[j]
-    return largest
+def _factor(g: Floats, order: NDArray[np.int64], first: int, last: int, factor: Floats) -> None:
+    """Rows first to last of the Cholesky factor of g[order, order]; its diagonal is inverted."""
+    for a in range(first, last):
+        for d in range(a):
+            x = g[order[a], order[d]]
+            for e in range(d):
+                x -= factor[a, e] * factor[d, e]
+            factor[a, d] = x * factor[d, d]
+        x = g[order[a], order[a]] + DAMPING
+        for e in range(a):
+            x -= factor[a, e] * factor[a, e]
+        factor[a, a] = 1 / np.sqrt(max(x, DAMPING))  # a pivot raised by rounding still makes a descent
 
 
 @numba.njit(cache=True)
-def _steepest(q: Array, b: Array, non_negative: bool) -> float:
-    """The largest slope along which an unpenalised weight may still move."""
-    largest = 0.0
-    for i in range(len(b)):
-        if non_negative and b[i] == 0.0:
-            largest = max(largest, q[i])
+def _face_minimum(
+    c: Floats, half: Floats, b: Floats, order: NDArray[np.int64], active: int, factor: Floats, target: Floats
+) -> None:
+    """Minimum over the active weights as if their signs could not change: g b = c - half sign(b)."""
+    for a in range(active):
+        x = c[order[a]] - np.copysign(half[order[a]], b[order[a]])
+        for e in range(a):
+            x -= factor[a, e] * target[e]
+        target[a] = x * factor[a, a]
+    for a in range(active - 1, -1, -1):
+        x = target[a]
+        for e in range(a + 1, active):
+            x -= factor[e, a] * target[e]
+        target[a] = x * factor[a, a]
+
+
+@numba.njit(cache=True)
+def _move(
+    b: Floats, target: Floats, order: NDArray[np.int64], active: int, signs_hold: bool
+) -> tuple[int, int, bool]:
+    """Move active weights towards the target until the first becomes 0 and leaves.
+
+    Returns how many are left, how many of them keep their row of the factor, and whether the target was reached.
+    """
+    step = 1.0
+    for a in range(active):
+        old = b[order[a]]
+        if signs_hold and old * target[a] <= 0:
+            step = min(step, old / (old - target[a]))
+    kept, factored = 0, active
+    for a in range(active):
+        i = order[a]
+        old = b[i]
+        leaves = signs_hold and old * target[a] <= 0 and old / (old - target[a]) <= step
+        b[i] = 0.0 if leaves else target[a] if step == 1 else old + step * (target[a] - old)
+        if b[i] == 0:
+            factored = min(factored, a)
         else:
-            largest = max(largest, abs(q[i]))
-    return largest
+            order[kept] = i
+            kept += 1
+    return kept, factored, step == 1
 
 
 @numba.njit(cache=True)
-def _refresh(G: Array, r: Array, b: Array, q: Array) -> None:
-    """Compute q = r - G b anew, without the rounding that updates have piled up."""
-    q[:] = r
+def _keep_bounded(b: Floats, half: Floats) -> None:
+    """The penalty of a minimum is at most ||y||^2 = 1; only an indefinite matrix, no Gram matrix, leads beyond."""
+    penalty, length = 0.0, 0.0
     for i in range(len(b)):
-        if b[i] != 0.0:
-            row = G[i]
-            for j in range(len(b)):
-                q[j] -= b[i] * row[j]
+        if b[i] != 0:
+            penalty += 2 * half[i] * abs(b[i])
+            length += abs(b[i])
+    excess = max(penalty, length / LONGEST)
+    if excess > 1:
+        b /= excess
 
 
-@numba.njit(cache=True)
-def _newton(G: Array, q: Array, b: Array, penalty: Array) -> bool:
-    """Go towards the minimum over the weights that are not 0, signs held, in place; whether one became 0 on the way.
-
-    Two ways are tried where some weight would change its sign: all along with such weights left at 0, which clears
-    many at once, and straight on until the first is 0, which always gains.
-    """
-    ids = np.flatnonzero(b)
-    n = len(ids)
-    slope = np.empty(n)
-    for i in range(n):
-        slope[i] = q[ids[i]] - (penalty[ids[i]] if b[ids[i]] > 0 else -penalty[ids[i]])
-    move = slope.copy()
-    _solve(G, ids, move)
-    curve, descent, curvature = _along(G, ids, slope, move)
-    if not (descent > 0.0 and curvature > 0.0):  # rounding rules here: sweeps are safer
-        return False
-
-    full = descent / curvature  # 1, unless pivots were raised
-    clipped = np.empty(n)
-    step, hit = full, -1
-    for i in range(n):
-        now = b[ids[i]]
-        clipped[i] = full * move[i]
-        if now * move[i] < 0.0 and abs(now) <= abs(clipped[i]):
-            clipped[i] = -now
-            if now / -move[i] <= step:
-                step, hit = now / -move[i], i
-    if (
-        hit < 0 and descent * full > 1.0
-    ):  # no objective can fall below 0: G is singular, and rounding says otherwise
-        return False
-    if hit >= 0:
-        clipped_curve, clipped_descent, clipped_curvature = _along(G, ids, slope, clipped)
-        if 2 * clipped_descent - clipped_curvature > step * (2 * descent - step * curvature):
-            move, curve, step = clipped, clipped_curve, 1.0
-    for i in range(n):
-        now = b[ids[i]]
-        after = now + step * move[i]
-        b[ids[i]] = 0.0 if i == hit or after * now <= 0.0 else after
-    for j in range(len(b)):
-        q[j] -= step * curve[j]
-    return hit >= 0
+# -- interior point ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True)
-def _along(G: Array, ids: NDArray[np.int64], slope: Array, move: Array) -> tuple[Array, float, float]:
-    """G move (all rows), slope . move and move . G move: the objective falls by twice the second less the third."""
-    curve = np.zeros(len(G))
-    for i in range(len(ids)):
-        row = G[ids[i]]
-        for j in range(len(G)):
-            curve[j] += move[i] * row[j]
-    descent, curvature = 0.0, 0.0
-    for i in range(len(ids)):
-        descent += slope[i] * move[i]
-        curvature += move[i] * curve[ids[i]]
-    return curve, descent, curvature
-
-
-@numba.njit(cache=True)
-def _solve(G: Array, ids: NDArray[np.int64], x: Array) -> None:
-    """Solve ``G[ids, ids] x = x`` in place by Cholesky, with pivots of repeated columns raised.
-
-    By rows, so that the innermost loops are contiguous and need no reordered sums to be vectorised.
-    """
-    n = len(ids)
-    U = np.empty((n, n))  # upper triangle: first G, then its factor, U^T U = G
-    for i in range(n):
-        for j in range(i, n):
-            U[i, j] = G[ids[i], ids[j]]
-    for i in range(n):
-        scale = 1.0 / np.sqrt(max(U[i, i], SMALLEST_PIVOT))
-        for j in range(i, n):
-            U[i, j] *= scale
-        U[i, i] = scale  # the inverse: only divisions need it
-        x[i] *= scale
-        for below in range(i + 1, n):
-            factor = U[i, below]
-            x[below] -= factor * x[i]
-            for j in range(below, n):
-                U[below, j] -= factor * U[i, j]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            x[i] -= U[i, j] * x[j]
-        x[i] *= U[i, i]
-
-
-# --- The interior-point method of [KKL*07] ---------------------------------------------------------------------------
-
-
-def _interior_point_each(
-    gram: NDArray[np.floating],
-    correlation: Array,
-    squared_norm: Array,
-    relative_lambda: float,
-    tolerance: float,
-) -> Fit:
-    m, k = correlation.shape
-    weights, objective, gap = np.zeros((m, k)), np.empty(m), np.empty(m)
+def _all_by_interior_point(
+    G: NDArray, r: Floats, s: Floats, eps: float, relative_lambda: float, tolerance: float, _: bool
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    m, k = r.shape
+    weights, objective, gap = np.zeros((m, k)), np.zeros(m), np.zeros(m)
     iterations = np.zeros(m, dtype=np.int64)
     for p in range(m):
-        s = float(squared_norm[p])
-        ids, G, r, penalty, length = _normalise(gram[p], correlation[p], s, relative_lambda)
-        b, primal, dual, iterations[p] = _interior_point(G, r, penalty, tolerance)
-        weights[p, ids] = b * length
-        objective[p], gap[p] = s * primal, s * max(primal - dual, 0.0)
-    return Fit(weights, objective, gap, iterations)
+        used, g, c, half, unit = _normalised(G[p], r[p], s[p], eps, relative_lambda)
+        b, iterations[p] = _interior_point(g, c, half, tolerance)
+        least, above = _objective_and_gap(b, c, c - g @ b, half, False)
+        objective[p], gap[p] = least * s[p], above * s[p]
+        weights[p, used] = b * unit
+    return weights, objective, gap, iterations
 
 
-def _interior_point(G: Array, r: Array, penalty: Array, tolerance: float) -> tuple[Array, float, float, int]:
-    """One normalised problem: weights, objective, its lower bound, Newton steps ([KKL*07] 4.1).
+def _interior_point(g: Floats, c: Floats, half: Floats, tolerance: float) -> tuple[Floats, int]:
+    """Log barrier of -u <= b <= u with Newton steps in (b, u) and t from the duality gap: [KKL07] IV.
 
-    Minimises ``t (||A b - y||^2 + 2 l^T u) - sum_i log(u_i^2 - b_i^2)`` over b and its bounds u, for growing t.
+    Newton's method does not see the scale of unknowns; the start is b = 0 with its u on the central path.
     """
-    n = len(r)
-    b, u = np.zeros(n), np.ones(n)
-    t = 1.0 / max(2 * penalty.max(initial=0.0), 1e-8)
-    dual = -np.inf
-    for steps in range(MAX_NEWTON_STEPS):
-        q = r - G @ b
-        primal, bound = _primal_and_dual(r, q, b, penalty, False)
-        dual = max(dual, bound)
-        if primal - dual <= tolerance:
-            return b, primal, dual, steps
-        db, du, descent = _newton_direction(G, q, b, u, penalty, t)
-        step = _backtrack(G, r, b, u, penalty, t, db, du, descent)
-        if step == 0.0:  # descent is lost in rounding
-            return b, primal, dual, steps
-        b, u = b + step * db, u + step * du
-        if step >= LONG_STEP:
-            t = max(BARRIER_GROWTH * min(2 * n / (primal - dual), t), t)
-    return b, primal, dual, MAX_NEWTON_STEPS
+    b, n = np.zeros(len(c)), len(c)
+    gap = _objective_and_gap(b, c, c, half, False)[1]
+    if gap <= tolerance:
+        return b, 0
+    t = 2 * n / gap
+    u = 1 / (t * half)
+    for iteration in range(1, MAX_NEWTON_STEPS + 1):
+        step = _newton_step(g, c, half, b, u, t)
+        if step is None:
+            return b, iteration
+        b, u, length = step
+        gap = _objective_and_gap(b, c, c - g @ b, half, False)[1]
+        if gap <= tolerance:
+            return b, iteration
+        if length >= 0.5:
+            t = max(2 * min(2 * n / gap, t), t)
+    return b, MAX_NEWTON_STEPS
 
 
-def _newton_direction(
-    G: Array, q: Array, b: Array, u: Array, penalty: Array, t: float
-) -> tuple[Array, Array, float]:
-    """Steps of b and u, and the slope along them. The blocks of u are diagonal, which leaves a system for b alone."""
-    square = (u - b) * (u + b)
-    gradient_b = -2 * t * q + 2 * b / square
-    gradient_u = 2 * t * penalty - 2 * u / square
-    same, mixed = 2 * (u**2 + b**2) / square**2, -4 * u * b / square**2
-    # same - mixed^2 / same, without its cancellation
-    reduced = 2 * t * G + np.diag(2 / (u**2 + b**2))
-    right = -gradient_b + mixed / same * gradient_u
-    db = scipy.linalg.solve(reduced, right, assume_a="pos")
-    du = -(gradient_u + mixed * db) / same
-    return db, du, float(gradient_b @ db + gradient_u @ du)
+def _newton_step(
+    g: Floats, c: Floats, half: Floats, b: Floats, u: Floats, t: float
+) -> tuple[Floats, Floats, float] | None:
+    """Next b, u and the length of the step to them; None where rounding lets the barrier fall no further."""
+    inside, squares = (u - b) * (u + b), u * u + b * b
+    slope_b, slope_u = 2 * t * (g @ b - c) + 2 * b / inside, 2 * t * half - 2 * u / inside
+    try:  # u is eliminated: of its block only 2 / (u^2 + b^2) is left on the diagonal
+        factor = scipy.linalg.cho_factor(2 * t * g + np.diag(2 / squares))
+    except scipy.linalg.LinAlgError:
+        return None
+    step_b = scipy.linalg.cho_solve(factor, -slope_b - 2 * u * b / squares * slope_u)
+    step_u = 2 * u * b / squares * step_b - slope_u * inside**2 / (2 * squares)
+
+    start = _barrier(g, c, half, b, u, t)
+    fall = slope_b @ step_b + slope_u @ step_u
+    length = 1.0
+    for _ in range(MAX_BACKTRACKS):
+        new_b, new_u = b + length * step_b, u + length * step_u
+        inner = bool((np.abs(new_b) < new_u).all())
+        if inner and _barrier(g, c, half, new_b, new_u, t) <= start + 0.01 * length * fall:
+            return new_b, new_u, length
+        length /= 2
+    return None
 
 
-def _backtrack(
-    G: Array, r: Array, b: Array, u: Array, penalty: Array, t: float, db: Array, du: Array, descent: float
-) -> float:
-    """The longest tried step inside the barrier that decreases the function enough; 0 if there is none."""
-
-    def value(step: float) -> float:
-        x, bound = b + step * db, u + step * du
-        if np.any(np.abs(x) >= bound):
-            return np.inf
-        smooth = x @ G @ x - 2 * x @ r + 1 + 2 * penalty @ bound
-        return float(t * smooth - np.log((bound - x) * (bound + x)).sum())
-
-    start, step = value(0.0), 1.0
-    while step > 1e-12:
-        if value(step) <= start + SUFFICIENT_DECREASE * step * descent:
-            return step
-        step *= BACKTRACKING
-    return 0.0
+def _barrier(g: Floats, c: Floats, half: Floats, b: Floats, u: Floats, t: float) -> float:
+    """The objective times t (less the constant 1, with u for |b|), and the logarithms."""
+    return float(t * (b @ (g @ b) - 2 * (b @ c) + 2 * (half @ u)) - np.log((u - b) * (u + b)).sum())
 
 
-# --- Checks ----------------------------------------------------------------------------------------------------------
+# -- least squares ----------------------------------------------------------------------------------------------------
 
 
-def _check_parameter(name: str, value: float, valid: bool, wanted: str) -> None:
-    if not (valid and np.isfinite(value)):
-        raise PrtError(f"{name} is {value}: give a finite number, {wanted}")
+def _by_eigenvectors(
+    G: Floats, r: Floats, s: Floats, relative_ridge: float, cut_off: float
+) -> tuple[Floats, Floats]:
+    """Weights and objectives of a block of problems."""
+    diagonal = np.einsum("mii->mi", G)  # [problem, unknown]
+    present = diagonal > 0
+    scale = np.abs(G).max(axis=(1, 2))
+    scale[scale == 0] = 1
+    G, r = G / scale[:, None, None], r / scale[:, None]
+    mean = (diagonal * present).sum(axis=1) / scale / np.maximum(present.sum(axis=1), 1)
+    ridge = relative_ridge * mean
 
+    values, vectors = np.linalg.eigh(G)  # [problem, eigenvalue], [problem, unknown, eigenvalue]
+    values = np.maximum(values, 0) + ridge[:, None]
+    kept = values > cut_off * values[:, -1:]
+    inverse = kept / np.where(kept, values, 1)
+    weights = np.einsum("mij,mj->mi", vectors, inverse * np.einsum("mij,mi->mj", vectors, r)) * present
 
-def _checked(
-    gram: NDArray[np.floating], correlation: NDArray[np.floating], squared_norm: NDArray[np.floating]
-) -> tuple[NDArray[np.floating], Array, Array]:
-    """The problems, once they are known to be usable, in the two layouts that kernels are compiled for."""
-    if gram.dtype not in (np.float32, np.float64):
-        raise PrtError(f"gram is {gram.dtype}: give float32 or float64")
-    m, k = correlation.shape if correlation.ndim == 2 else (-1, -1)
-    if (gram.shape, squared_norm.shape) != ((m, k, k), (m,)):
-        shapes = f"{gram.shape}, {correlation.shape}, {squared_norm.shape}"
-        raise PrtError(f"gram, correlation, squared_norm are {shapes}: give (m, k, k), (m, k), (m,)")
-    G = np.ascontiguousarray(gram)  # the large one keeps its precision
-    r = np.ascontiguousarray(correlation, dtype=np.float64)
-    s = np.ascontiguousarray(squared_norm, dtype=np.float64)
-    bad = _unusable(G, r, s)
-    if bad.any():
-        first, others = int(np.flatnonzero(bad)[0]), int(bad.sum()) - 1
-        raise PrtError(
-            f"problem {first} of {len(bad)} (and {others} more) has NaN, Inf or a negative square in gram, "
-            "correlation or squared_norm: look for what is not finite in its rows of transport"
-        )
-    return G, r, s
-
-
-@numba.njit(parallel=True, cache=True)
-def _unusable(gram: NDArray[np.floating], correlation: Array, squared_norm: Array) -> NDArray[np.bool_]:
-    """(m,): whether a problem is not finite, or no A and y can have led to it."""
-    m, k = correlation.shape
-    bad = np.zeros(m, dtype=np.bool_)
-    for p in numba.prange(m):
-        found = not (np.isfinite(squared_norm[p]) and squared_norm[p] >= 0)
-        for i in range(k):
-            found |= not (np.isfinite(correlation[p, i]) and gram[p, i, i] >= 0)
-            for j in range(k):
-                found |= not np.isfinite(gram[p, i, j])
-        bad[p] = found
-    return bad
+    square = np.einsum("mi,mi->m", weights, np.einsum("mij,mj->mi", G, weights) - 2 * r) * scale + s
+    return weights, np.maximum(square, 0) + ridge * scale * (weights**2).sum(axis=1)

@@ -15,6 +15,9 @@ from scipy.spatial import cKDTree
 
 from mi_sparse_prt.errors import PrtError
 
+GAUSSIANS = 1.5  # standard deviations (times sqrt 2) at which the farthest neighbour of linear weights is
+NORMAL_UNIT = 2.0  # slopes in normals count from differences of half a unit on
+RIDGE = 0.3  # of slopes, in squared steps between dense vertices
 LEAST_COSINE = (
     0.2  # between the normals of neighbours on a surface; below, they see different halves of the scene
 )
@@ -130,6 +133,52 @@ def surface_neighbours(
             break
         reach, short = 2 * reach, short[~kept.all(axis=1)]
     return Neighbours(ids, distances)
+
+
+def linear_weights(
+    neighbours: Neighbours,
+    positions: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    dense_positions: NDArray[np.floating],
+    dense_normals: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Weights (n, k) of neighbours that reproduce what is linear in position and normal; rows sum to 1.
+
+    Moving least squares: the value at the point of the linear function that fits the neighbours best, each counting
+    with a Gaussian of its distance. A ridge on the slopes keeps weights bounded where neighbours do not span them
+    (on a line, on a plane, all in one place), and turns to the plain mean there.
+
+    Parameters
+    ----------
+    neighbours : Neighbours
+        Of ``surface_neighbours``.
+    positions, normals : (n, 3) float
+    dense_positions, dense_normals : (n_dense, 3) float
+
+    Returns
+    -------
+    (n, k) float32
+        0 where there is no neighbour.
+    """
+    ids, present = np.maximum(neighbours.ids, 0), neighbours.ids >= 0
+    distances = np.where(present, neighbours.distances, 0)
+    reach = np.maximum(distances.max(axis=1, keepdims=True, initial=0) / GAUSSIANS, 1e-30)
+    near = np.where(present, np.exp(-((distances / reach) ** 2)), 0)  # [point, neighbour]
+    near /= np.maximum(near.sum(axis=1, keepdims=True), 1e-30)
+    step = np.maximum(reach / GAUSSIANS, 1e-30)[..., None]
+    terms = np.concatenate(
+        [
+            (dense_positions[ids] - positions[:, None]) / step,
+            (dense_normals[ids] - normals[:, None]) * NORMAL_UNIT,
+        ],
+        axis=2,
+    )  # [point, neighbour, slope]
+    mean = np.matmul(near[:, None], terms)[:, 0]  # [point, slope]
+    centred = terms - mean[:, None]
+    weighted = near[..., None] * centred
+    system = np.matmul(weighted.transpose(0, 2, 1), centred) + RIDGE * np.eye(terms.shape[2])
+    slopes = np.linalg.solve(system, mean[..., None])[..., 0]
+    return np.asarray(near - np.matmul(weighted, slopes[..., None])[..., 0], np.float32)
 
 
 def inverse_distance_weights(neighbours: Neighbours) -> NDArray[np.float32]:
