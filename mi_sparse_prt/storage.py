@@ -24,7 +24,7 @@ from mi_sparse_prt.matrix import Indirect, Interpolated, LightTransport, MeanCos
 from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
-VERSION = 1
+VERSION = 2
 _VERTEX_CHUNK = 4096
 # what Zarr, zip and our own assembly raise when a file is not what it should be
 _DAMAGE = (OSError, zipfile.BadZipFile, zlib.error, LookupError, TypeError, ValueError, RuntimeError)

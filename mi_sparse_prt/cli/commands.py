@@ -16,6 +16,7 @@ from mi_sparse_prt.cli.running import check_folder, running
 from mi_sparse_prt.cli.tables import (
     benchmark_tables,
     matrix_tables,
+    methods_tables,
     relighting_table,
     scene_report,
     scene_tables,
@@ -112,6 +113,14 @@ Variant = Annotated[
 ]
 
 
+class Method(StrEnum):
+    """Which elements are evaluated."""
+
+    brute_force = "brute_force"
+    sparse = "sparse"
+    huang2010 = "huang2010"
+
+
 @app.command()
 def precompute(
     scene: SceneFile,
@@ -128,6 +137,12 @@ def precompute(
     resolution: Annotated[
         int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
     ] = 32,
+    method: Annotated[
+        Method,
+        typer.Option(
+            help="Evaluate every element, few of them (sparse), or few as in the paper (huang2010)."
+        ),
+    ] = Method.brute_force,
     basis: Annotated[
         Basis, typer.Option(help="Light from a texel's centre alone, or from its whole area.")
     ] = Basis.direction,
@@ -186,11 +201,14 @@ def precompute(
         if checkpoint is not None:
             check_folder(checkpoint)
             command.hint = f"; finished rows are in {checkpoint}, the same command goes on with them"
-        coarse = min(8, resolution) if indirect_resolution is None else indirect_resolution
+        coarse = indirect_resolution
+        if coarse is None and method is Method.brute_force:
+            coarse = min(8, resolution)
         with command.prompt_interrupts():
             transport = prt.precompute(
                 loaded,
                 prt.CubemapLighting(resolution),
+                method=method.value,
                 basis=basis.value,
                 max_depth=max_depth,
                 spp=spp,
@@ -393,6 +411,13 @@ def benchmark(
     repeats: Annotated[
         int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")
     ] = 3,
+    method: Annotated[
+        list[Method] | None,
+        typer.Option(
+            help="Measure time and error of a method against brute force instead; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     edge_length: EdgeLength = None,
     define: Define = None,
     variant: Variant = None,
@@ -406,14 +431,17 @@ def benchmark(
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
     from mi_sparse_prt.benchmark import run_benchmark
+    from mi_sparse_prt.benchmark.methods import measure_methods
 
     with running(json_file, quiet) as command:
         loaded = prt.load_scene(scene, edge_length, **_definitions(define))
+        lighting = prt.CubemapLighting(resolution)
         with command.prompt_interrupts():
-            command.report = run_benchmark(
-                loaded, prt.CubemapLighting(resolution), repeats, progress=not quiet
-            )
-        command.show(*benchmark_tables(command.report))
+            if method:
+                command.report = measure_methods(loaded, lighting, [m.value for m in method], not quiet)
+            else:
+                command.report = run_benchmark(loaded, lighting, repeats, progress=not quiet)
+        command.show(*(methods_tables if method else benchmark_tables)(command.report))
 
 
 def _scene_of(

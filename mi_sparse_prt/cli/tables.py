@@ -173,6 +173,35 @@ def benchmark_tables(report: dict[str, Any]) -> list[Table]:
     return [rays, walks, frames, host]
 
 
+def methods_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_methods`` found: cost and error of each method, and where its time went."""
+    brute = report["brute_force"]
+    tables = []
+    for method, found in report["methods"].items():
+        table = _table(f"{method} against brute force ({_duration(brute['seconds'])})", "", "")
+        table.add_row("elements evaluated", f"{found['elements']:.2%}")
+        for part, share in found["elements_of_parts"].items():
+            table.add_row(f"  {part}", f"{share:.2%}")
+        table.add_row("time / brute force", f"{found['ratio']:.1%}")
+        overhead = found["overhead"]
+        table.add_row(
+            "overhead",
+            f"{overhead['share']:.1%}, {overhead['microseconds_per_sparse_vertex']:.0f} us per sparse vertex",
+        )
+        for mesh, errors in found["errors"].items():
+            parts = ", ".join(f"{part} {value:.2%}" for part, value in errors.items())
+            table.add_row(f"relative L2, {mesh}", parts)
+            noise = report["reference_noise"][mesh]
+            table.add_row("  noise of the reference", f"{noise:.2%}")
+        for mesh, rates in found["sampling"].items():
+            rows = ", ".join(f"{name.replace('_', ' ')} {value:.1%}" for name, value in rates.items())
+            table.add_row(f"sampling, {mesh}", rows)
+        for phase, seconds in found["seconds"].items():
+            table.add_row(f"  {phase}", _duration(seconds))
+        tables.append(table)
+    return tables
+
+
 def _kernel_row(kernels: dict[str, Any], blocks: int) -> tuple[str, str]:
     found = ", ".join(
         f"{kernels[k]} {label}" for k, label in (("compiled", "compiled"), ("on_disk", "from disk"))

@@ -31,7 +31,7 @@ from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
-DENSE = 0.17  # of the vertices of a mesh
+DENSE = 0.2  # of the vertices of a mesh
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 NEIGHBOURS = 12
 LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
