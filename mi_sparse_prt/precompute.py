@@ -59,8 +59,8 @@ def precompute(
     scene : Scene
     lighting : CubemapLighting
         The emission space: one column per texel.
-    method : {"brute_force"}
-        Every element is evaluated.
+    method : {"brute_force", "sparse", "huang2010"}
+        Evaluate every element; few of them (``methods.sparse``); or few as [HR10] does (``methods.huang2010``).
     basis : {"direction", "texel"}
         Whether a texel's light arrives from its centre alone or from its whole area.
     max_depth : int
@@ -99,6 +99,8 @@ def precompute(
     settings = Settings(
         lighting.resolution, method, basis, max_depth, spp, target_error, seed, indirect_resolution, strata
     )
+    if checkpoint_folder is not None and method != "brute_force":
+        raise PrtError(f"method {method!r} keeps no checkpoints; leave checkpoint_folder out")
     reset_peak_memory()
     clock, points = Stopwatch(), vertex_points(scene)
     settings, plans = _planned(scene, lighting, settings, clock)

@@ -42,6 +42,11 @@ class Settings:
                     f"method {self.method!r} chooses the directions of the indirect light itself; "
                     "leave indirect_resolution out"
                 )
+            if self.target_error is not None:
+                raise PrtError(
+                    f"method {self.method!r} cannot aim at a target error yet; leave target_error out, "
+                    "and look at the estimated error in the report"
+                )
         if self.basis not in BASES:
             raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")
         for name, least in (("spp", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):

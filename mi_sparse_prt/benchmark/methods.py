@@ -186,7 +186,7 @@ class _Reference:
         found = {}
         for k, mesh in enumerate(self.scene.meshes):
             ids, texels = self.vertices[k], self.texels[k][..., None]
-            indirect = np.zeros(1)
+            indirect: NDArray[np.floating] = np.zeros(1)
             if transport.indirect is not None:
                 indirect = np.take_along_axis(transport.indirect.rows(ids), texels, axis=1)
             direct = np.take_along_axis(transport.direct.rows(ids), texels, axis=1) - self._exact(k)

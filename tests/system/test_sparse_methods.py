@@ -1,0 +1,311 @@
+"""Whole precomputations by few elements against brute force on the same scene: what they promise, and what it costs."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from conftest import COLOURS, GREY, T, build, diffuse, mesh, still_life
+from numpy.typing import NDArray
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.matrix import Interpolated, LightTransport, Visibility
+from mi_sparse_prt.sampling.bits import unpack
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.path import PathTransport
+
+LIGHTING = prt.CubemapLighting(8)
+N = LIGHTING.n_directions
+METHODS = ("sparse", "huang2010")
+WORST = {"sparse": 0.12, "huang2010": 0.35}  # relative L2 of the direct light of so small and coarse a scene
+EDGE = 0.25
+
+
+def precompute(scene: prt.Scene, method: str, max_depth: int = 2, **parameters: object) -> LightTransport:
+    parameters = {"spp": 4, "progress": False, **parameters}
+    return prt.precompute(scene, LIGHTING, method=method, max_depth=max_depth, **parameters)
+
+
+@cache
+def scene() -> prt.Scene:
+    """The ball and the box over the ground, 865 vertices."""
+    return build(EDGE, **still_life())
+
+
+@cache
+def brute_force() -> LightTransport:
+    return precompute(scene(), "brute_force")
+
+
+@cache
+def result(method: str, max_depth: int) -> LightTransport:
+    return precompute(scene(), method, max_depth)
+
+
+def rows(transport: LightTransport) -> NDArray[np.float64]:
+    return transport.rows(np.arange(transport.shape[0])).astype(np.float64)
+
+
+def relative(a: NDArray, b: NDArray) -> float:
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def true_error(transport: LightTransport) -> float:
+    """Of direct light, exactly."""
+    return relative(rows(transport), rows(brute_force()))
+
+
+class Counter:
+    """Elements that are asked of the solvers, apart from those held out for the estimate of the error."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, n_vertices: int) -> None:
+        self.times = np.zeros((n_vertices, N), int)
+        self.paths = 0
+        visible, indirect = DirectTransport.visible, PathTransport.elements
+
+        def counted_visible(solver: DirectTransport, points: NDArray, texels: NDArray) -> NDArray:
+            np.add.at(self.times, (points, texels), 1)
+            return visible(solver, points, texels)
+
+        def counted_indirect(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+            if solver.spp != 64:  # those held out
+                self.paths += len(points) * solver.spp
+            return indirect(solver, points, texels, *seed)
+
+        monkeypatch.setattr(DirectTransport, "visible", counted_visible)
+        monkeypatch.setattr(PathTransport, "elements", counted_indirect)
+
+
+# ------------------------------------------------------------------------------------ against brute force
+
+
+def test_what_sparse_evaluates_is_exact(monkeypatch):
+    """Rationale: borrowed values may be wrong, traced ones may not; and no ray is traced for nothing.
+
+    Every ray of ``method="sparse"`` is recorded.
+
+    Expected: where one was traced, the bit is that of brute force; nobody asks twice or below the horizon; the report
+    counts those rays. Errors are left only where nothing was traced.
+    """
+    counter = Counter(monkeypatch, scene().n_vertices)
+    transport = precompute(scene(), "sparse", 4)
+    assert isinstance(transport.direct, Visibility)
+    ours, true = (unpack(t.direct.bits, N) for t in (transport, brute_force()))
+    asked = counter.times > 0
+    assert np.array_equal(ours[asked], true[asked])
+    assert (ours != true).any()  # it is no brute force in disguise
+    assert (ours != true).mean() < 0.02
+    assert counter.times.max() == 1
+    cosine = scene().normals @ LIGHTING.directions.T
+    assert (cosine[asked] > -1e-6).all()
+    assert not ours[cosine < -1e-6].any()
+    assert transport.report["rays"] == {"direct": asked.sum(), "indirect_paths": counter.paths}
+    assert np.array_equal(transport.direct.bits, result("sparse", 2).direct.bits)  # bounces do not touch it
+
+
+@pytest.mark.parametrize("max_depth", [2, 4])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_error_is_small(method, max_depth):
+    """Rationale: the direct light is what sharp shadows are made of; indirect light is 5% of this scene.
+
+    Expected: direct light within 12% (sparse) and 35% (as published) of brute force in relative L2 at 8 x 8 texels per
+    face; sums over the sky, what even light gives, within 3% and 20%.
+    """
+    transport = result(method, max_depth)
+    if max_depth == 2:
+        assert transport.indirect is None
+        assert 0.001 < true_error(transport) < WORST[method]
+    else:
+        assert transport.report["estimated_error"]["total"] < WORST[method]
+    even = transport.relight(1.0)
+    expected = (brute_force() if max_depth == 2 else full()).relight(1.0)
+    assert relative(even, expected) < {"sparse": 0.03, "huang2010": 0.2}[method]
+
+
+@cache
+def full() -> LightTransport:
+    return precompute(scene(), "brute_force", 4)
+
+
+def test_sparse_is_better_for_less():
+    ours, published = (result(method, 2) for method in METHODS)
+    assert true_error(ours) < 0.7 * true_error(published)
+    assert ours.report["elements_evaluated"] < 1.1 * published.report["elements_evaluated"]
+
+
+def test_indirect_light_of_sparse():
+    """Against brute force at 256 paths: the total within 3%, and per vertex, under even light, within 10%."""
+    ours = result("sparse", 4)
+    assert isinstance(ours.indirect, Interpolated)
+    assert ours.direct.bits.shape == brute_force().direct.bits.shape
+    true = precompute(scene(), "brute_force", 4, spp=64).indirect
+    even = np.ones((N, 3), np.float32)
+    a, b = ours.indirect.relight(even), true.relight(even)
+    assert a.sum() == pytest.approx(b.sum(), rel=0.03)
+    assert relative(a, b) < 0.2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_estimate_covers_the_true_error(method):
+    """Direct light of 4 seeds; the truth is exact. All within four of the reported standard errors, most in two."""
+    deviations = []
+    for seed in range(4):
+        transport = precompute(scene(), method, seed=seed)
+        reported = transport.report["estimated_error"]
+        deviations.append((reported["total"] - true_error(transport)) / reported["standard_error"]["total"])
+        assert reported["standard_error"]["total"] < 0.3 * reported["total"]
+    assert (np.abs(deviations) < 2).sum() >= 3
+    assert np.abs(deviations).max() < 4
+
+
+# ------------------------------------------------------------------------------------ the report
+
+
+@pytest.mark.parametrize("max_depth", [2, 4])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_report(method, max_depth):
+    report = result(method, max_depth).report
+    assert json.loads(json.dumps(report)) == report
+    assert report["elements_total"] == scene().n_vertices * N
+    assert 0.02 * report["elements_total"] < report["elements_evaluated"] < 0.6 * report["elements_total"]
+
+    # the rates of the meshes say the same as the total
+    total = 0.0
+    for part in scene().meshes:
+        rates, n = report["sampling"][part.name], part.vertices.stop - part.vertices.start
+        dense = rates["dense_vertices"]
+        assert rates["elements"] == pytest.approx(
+            dense * rates["dense_directions"] + (1 - dense) * rates["sparse_directions"]
+        )
+        assert all(0 <= rate <= 1 for rate in rates.values())
+        total += rates["elements"] * n * N
+    assert total == pytest.approx(report["elements_evaluated"], abs=0.5)
+
+    assert (report["rays"]["indirect_paths"] > 0) == (max_depth == 4)
+    assert report["rays"]["indirect_paths"] == 4 * report["elements"]["indirect"]
+    assert report["parameters"]["method"] == method
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_phases_add_up(method):
+    seconds = dict(result(method, 4).report["seconds"])
+    total, compiling = seconds.pop("total"), seconds.pop("compile")
+    assert compiling >= 0
+    assert all(value >= 0 for value in seconds.values())
+    assert sum(seconds.values()) == pytest.approx(total, rel=0.02)
+    expected = {"spatial_sampling", "rank", "angular_sampling", "dense_rays", "sparse_rays", "dense_paths"}
+    assert expected | {"neighbours", "solver", "held_out", "other"} <= seconds.keys()
+    assert seconds["other"] < 0.3 * total
+
+
+# ------------------------------------------------------------------------------------ what must not matter
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_seed_decides_all(method):
+    again, other = precompute(scene(), method, 4), precompute(scene(), method, 4, seed=1)
+    assert np.array_equal(rows(again), rows(result(method, 4)))
+    assert again.report["estimated_error"] == result(method, 4).report["estimated_error"]
+    assert not np.array_equal(rows(other), rows(again))
+
+
+def shuffled(source: prt.Scene, seed: int) -> prt.Scene:
+    """Shapes, vertices and triangles in another order (0: the scene's own); normals come with the file."""
+    rng = np.random.default_rng(seed)
+    shapes = {}
+    for k in rng.permutation(len(source.meshes)) if seed else range(len(source.meshes)):
+        part = source.meshes[k]
+        n = part.vertices.stop - part.vertices.start
+        order = rng.permutation(n) if seed else np.arange(n)  # new vertex i was vertex order[i]
+        triangles = np.argsort(order)[part.triangles]
+        shape = mesh(part.name, source.positions[part.vertices][order], triangles, diffuse(*COLOURS[k]))
+        parameters = prt.scene.mi.traverse(shape)
+        parameters["vertex_normals"] = prt.scene.mi.Float(source.normals[part.vertices][order].ravel())
+        parameters.update()
+        shapes[part.name] = shape
+    return build(float("inf"), **shapes)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_order_of_shapes_and_vertices(method):
+    """Rationale: the choice of vertices, their neighbours and pools are made of places and keys, not of numbers.
+
+    Expected: bit-identical direct light; with indirect light the same but for the rounding of sums (float16 storage).
+    """
+    first, second = (shuffled(scene(), seed) for seed in (0, 1))
+    assert first.hash == second.hash
+    assert not np.array_equal(first.positions, second.positions)
+    ids = np.arange(first.n_vertices)
+    for max_depth in (2, 4):
+        a, b = (precompute(s, method, max_depth).for_scene(first) for s in (first, second))
+        assert a.report["elements_evaluated"] == b.report["elements_evaluated"]
+        assert relative(b.rows(ids), a.rows(ids)) < (1e-7 if max_depth == 2 else 1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_merged_scene_gets_the_same_rows(method):
+    """One material, shapes merged by Mitsuba: the matrix of the separate scene serves it, in its order."""
+    shapes = still_life((GREY[0],) * 3)
+    apart, merged = (
+        build(0.5, optimize=o, **dict(s)) for o, s in ((False, shapes), (True, reversed(shapes.items())))
+    )
+    transport = precompute(apart, method, 4)
+    turned = transport.for_scene(merged)
+    row_of = {tuple(p): i for i, p in enumerate(np.c_[apart.positions, apart.normals].tolist())}
+    source = [row_of[tuple(p)] for p in np.c_[merged.positions, merged.normals].tolist()]
+    assert np.array_equal(rows(turned), transport.rows(source))
+    assert np.array_equal(turned.relight([1, 2, 3]), transport.relight([1, 2, 3])[source])
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(1e-3, 0), (1e3, 0), (1, 3)], ids=["a thousandth", "a thousand times", "moved"]
+)
+@pytest.mark.parametrize("method", METHODS)
+def test_place_and_scale(method, scale, offset):
+    """Keys and with them the dense vertices are others; errors and costs stay what they are."""
+    place = T().translate([offset] * 3).scale(scale)
+    there = precompute(build(EDGE * scale, **still_life(place=place)), method)
+    here = result(method, 2)
+    assert 0.6 < there.report["estimated_error"]["total"] / here.report["estimated_error"]["total"] < 1.6
+    assert there.report["elements_evaluated"] == pytest.approx(here.report["elements_evaluated"], rel=0.15)
+
+
+# ------------------------------------------------------------------------------------ special scenes
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_bounces_off_black(method, monkeypatch):
+    counter = Counter(monkeypatch, scene().n_vertices)
+    transport = precompute(build(EDGE, **still_life(((0, 0, 0),) * 3)), method, 4)
+    assert transport.indirect is None
+    assert counter.paths == 0
+    assert any("black" in sentence for sentence in transport.report["skipped"])
+    assert not rows(transport).any()
+
+
+def test_a_convex_object_alone():
+    """Rationale: where nothing is hidden there is nothing to learn. An open ball in the sky.
+
+    Expected: exact, without indirect light, from less than a tenth of the elements; sparse vertices cost only their
+    share of the horizon and what is held out.
+    """
+    transport = precompute(build(0.2, ball={"type": "sphere", "bsdf": diffuse(1, 1, 1)}), "sparse", 4)
+    report = transport.report
+    assert transport.indirect is None
+    assert report["estimated_error"]["total"] < 1e-6
+    assert report["rays"]["direct"] < 0.1 * report["elements_total"]
+    cosine = np.maximum(transport.direct.normals @ LIGHTING.directions.T, 0)
+    expected = cosine * LIGHTING.solid_angles / np.pi
+    assert np.allclose(rows(transport)[..., 0], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("wrong", [{"basis": "texel"}, {"indirect_resolution": 4}], ids=str)
+def test_what_does_not_go_together_is_refused(method, wrong):
+    with pytest.raises(prt.PrtError, match=method):
+        precompute(scene(), method, 4, **wrong)
+
+
+def test_an_unknown_method_names_those_there_are():
+    with pytest.raises(prt.PrtError, match="sparse.*huang2010"):
+        precompute(scene(), "dense")
