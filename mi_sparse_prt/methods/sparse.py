@@ -158,6 +158,8 @@ class _Visibility:
         What is traced are the directions in which the nearest of all vertices differ: they are nearer than the dense
         ones, and know more by now.
         """
+        if not len(group.sparse):
+            return 0
         with self._clock.phase("repair"):
             poor = group.sparse[self._pooled_error(scene, group, seed) > TOLERATED**2]
             if not len(poor):

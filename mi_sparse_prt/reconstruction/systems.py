@@ -13,7 +13,7 @@ def normal_equations(
     neighbours: NDArray[np.int32],
     directions: NDArray[np.int32],
     values: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Gram form of ``A a = y`` for n vertices, A having the neighbours' rows at the sampled directions as columns.
 
     Parameters
@@ -30,12 +30,13 @@ def normal_equations(
     Returns
     -------
     gram (n, k, k), correlation (n, k), squared_norm (n,)
-        A^T A, A^T y and y^T y, summed in float64; zeros for unknowns that a vertex lacks.
+        float64: A^T A, A^T y and y^T y; zeros for unknowns that a vertex lacks.
     """
     n, k = neighbours.shape
-    gram = np.zeros((n, k, k), np.float32)
-    correlation = np.zeros((n, k), np.float32)
-    squared_norm = np.zeros(n, np.float32)
+    # float64: neighbouring rows are nearly equal, and least squares sees the difference
+    gram = np.zeros((n, k, k))
+    correlation = np.zeros((n, k))
+    squared_norm = np.zeros(n)
     for i in numba.prange(n):
         system, y = _gathered(rows, neighbours[i], directions[i], values[i])
         gram[i] = system.T @ system

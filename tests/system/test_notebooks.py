@@ -17,16 +17,27 @@ nbclient = pytest.importorskip("nbclient", reason="needs the extra `notebooks`")
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
 # Small values for the cell tagged "parameters": the whole notebook in seconds
-SETTINGS = {
-    "RESOLUTION": 4,
-    "EDGE_LENGTH": 1e9,  # meshes as they are
-    "SPP": 1,
-    "INDIRECT_RESOLUTION": 2,
-    "IMAGE_WIDTH": 48,
-    "REFERENCE_ROWS": 4,
-    "REFERENCE_COLUMNS": 4,
-    "REFERENCE_SPP": 4,
-    "IMAGE_SPP": 4,
+SETTINGS: dict[str, dict[str, Any]] = {
+    "01_first_matrix": {
+        "RESOLUTION": 4,
+        "EDGE_LENGTH": 1e9,  # meshes as they are
+        "SPP": 1,
+        "INDIRECT_RESOLUTION": 2,
+        "IMAGE_WIDTH": 48,
+        "REFERENCE_ROWS": 4,
+        "REFERENCE_COLUMNS": 4,
+        "REFERENCE_SPP": 4,
+        "IMAGE_SPP": 4,
+    },
+    "02_sparse_precomputation": {
+        "RESOLUTION": 8,
+        "EDGE_LENGTH": 1.0,
+        "SPP": 2,
+        "IMAGE_WIDTH": 96,
+        "RADII": [0.1, 0.2],
+        "RADIUS_VERTICES": 20,
+        "DIRECTIONS": 20,
+    },
 }
 
 
@@ -41,7 +52,7 @@ def test_notebook_runs_and_draws(path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "stored outputs: clear them"
-    _override(notebook, SETTINGS)
+    _override(notebook, SETTINGS[path.stem])
 
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     client = nbclient.NotebookClient(

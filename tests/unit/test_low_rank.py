@@ -33,7 +33,7 @@ def error(a: NDArray, b: NDArray) -> float:
 def predicted(strength: float, beta: float) -> float:
     """Squared error after over before, as Gavish and Donoho (2017) have it for large matrices.
 
-    A singular value x appears as y = sqrt((x + 1/x)(x + beta/x)) and is shrunk to eta; what is left is x^2 - eta^2. What
+    A singular value x appears as y = sqrt((x + 1/x)(x + beta/x)) and is shrunk to eta; x^2 - eta^2 is left. What
     noise there was had beta LONG in these units.
     """
     x = strength * np.arange(1, R + 1)
