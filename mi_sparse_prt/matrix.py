@@ -221,7 +221,7 @@ class Interpolated:
         weights = self.weights[np.asarray(ids)]
         needed = np.unique(weights.indices)
         dense = self.dense.rows(needed)  # [needed dense row, direction, channel]
-        flat = weights[:, needed] @ dense.reshape(len(needed), -1)
+        flat = weights[:, needed] @ dense.reshape(len(needed), dense.shape[1] * dense.shape[2])
         return flat.reshape(len(ids), *dense.shape[1:])
 
     def columns(self, ids: Rows) -> NDArray[np.float32]:

@@ -159,7 +159,9 @@ def _sparse_arrays(name: str, matrix: scipy.sparse.csr_array) -> dict[str, NDArr
 
 def _sparse_matrix(name: str, arrays: dict[str, NDArray[Any]], columns: int) -> scipy.sparse.csr_array:
     data, indices, indptr = (arrays[f"{name}_{part}"] for part in ("data", "indices", "indptr"))
-    return scipy.sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, columns))
+    matrix = scipy.sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, columns))
+    matrix.check_format(full_check=True)  # products do not look whether an index is out of range
+    return matrix
 
 
 def _read(array: Any) -> NDArray[Any]:

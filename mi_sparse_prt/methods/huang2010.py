@@ -124,6 +124,9 @@ def _fitted(
             sampled = _sampled(direct, indirect, ids, directions, clock)
             with clock.phase("solver"):
                 fit = _weights(stacked, near, directions, sampled, direct.lighting.n_directions)
+                # no features, no equations: the neighbours do not differ there, and their mean stands for them
+                alone = (directions < 0).all(axis=1)
+                fit[alone] = (near[alone] >= 0) / np.maximum((near[alone] >= 0).sum(axis=1, keepdims=True), 1)
                 used = fit != 0
                 owners.append(np.repeat(ids, used.sum(axis=1)))
                 columns.append(near[used])

@@ -225,6 +225,8 @@ def _indirect_rows(
     density = np.empty((len(dense.ids), len(grid.texels), indirect.channels), np.float16)
     for mesh in scene.meshes:
         chosen = dense.of_mesh(mesh)
+        # by key: sums over rows then round alike in whatever order vertices come
+        chosen = chosen[np.argsort(indirect.points.keys[dense.ids[chosen]], kind="stable")]
         with clock.phase("dense_paths"):
             rows = indirect_of(indirect, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress)
         with clock.phase("low_rank"):

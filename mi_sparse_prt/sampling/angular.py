@@ -113,7 +113,9 @@ class AngularGrid:
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 texels, inside = self._shifted(dx, dy)
-                good = np.flatnonzero(self._sampled[texels] & inside)
+                # a sampled texel keeps its own value
+                wanted = ~self._sampled if dx or dy else np.ones_like(self._sampled)
+                good = np.flatnonzero(self._sampled[texels] & inside & wanted)
                 rows.append(good)
                 columns.append(index[texels[good]])
                 weights.append(np.full(len(good), (1 - abs(dx) / 2) * (1 - abs(dy) / 2)))

@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -310,3 +311,34 @@ def test_what_does_not_go_together_is_refused(method, wrong):
 def test_an_unknown_method_names_those_there_are():
     with pytest.raises(prt.PrtError, match="sparse.*huang2010"):
         precompute(scene(), "dense")
+
+
+def test_meshes_whose_vertices_are_all_dense() -> None:
+    """A scene so coarse that some meshes have nothing but dense vertices.
+
+    Rationale: there is nothing to repair there, and no neighbour to ask.
+    Expected: a matrix without NaN.
+    Result: it is.
+    """
+    scene = build(0.5, **still_life(place=T().translate([3, 3, 3])))
+    transport = prt.precompute(
+        scene, prt.CubemapLighting(8), method="sparse", max_depth=2, spp=4, progress=False
+    )
+    assert np.isfinite(transport.rows(np.arange(len(scene.positions)))).all()
+
+
+def test_no_rows_are_asked_for(grey_scene: prt.Scene) -> None:
+    """``rows`` of an empty list of an interpolated matrix is empty, as that of any other."""
+    transport = prt.precompute(
+        grey_scene, prt.CubemapLighting(4), method="huang2010", max_depth=2, progress=False
+    )
+    assert transport.rows([]).shape == (0, 96, 3)
+
+
+def test_target_errors_and_checkpoints_are_refused_by_name(grey_scene: prt.Scene, tmp_path: Path) -> None:
+    """What a sparse method does not do yet is an error that says so."""
+    lighting = prt.CubemapLighting(4)
+    with pytest.raises(prt.errors.PrtError, match="target error"):
+        prt.precompute(grey_scene, lighting, method="sparse", target_error=0.1, progress=False)
+    with pytest.raises(prt.errors.PrtError, match="checkpoint"):
+        prt.precompute(grey_scene, lighting, method="sparse", checkpoint_folder=tmp_path, progress=False)
