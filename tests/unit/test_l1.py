@@ -6,6 +6,7 @@ import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.linear_model import Lasso
 
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.reconstruction.l1 import Fit, l1_fit, least_squares_fit
@@ -188,14 +189,13 @@ def test_single_precision():
 
 
 def test_sklearn_agrees():
-    linear_model = pytest.importorskip("sklearn.linear_model")
     rng = np.random.default_rng(0)
     A, y = rng.normal(size=(20, 40, 15)), rng.normal(size=(20, 40))
     for non_negative in (False, True):
         fit = l1_fit(*products(A, y), 0.05, tolerance=1e-12, non_negative=non_negative)
         for i in range(len(A)):
             alpha = 0.05 * np.abs(2 * A[i].T @ y[i]).max() / (2 * A.shape[1])
-            theirs = linear_model.Lasso(
+            theirs = Lasso(
                 alpha, fit_intercept=False, tol=1e-12, max_iter=100_000, positive=non_negative
             ).fit(A[i], y[i])
             np.testing.assert_allclose(fit.weights[i], theirs.coef_, atol=1e-5)

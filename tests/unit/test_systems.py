@@ -17,7 +17,7 @@ def test_normal_equations_against_numpy(n, n_dense, k, s, seed):
     directions = rng.integers(-1, 12, (n, s)).astype(np.int32)
     values = rng.normal(size=(n, s)).astype(np.float32)  # also where there is no direction
     gram, correlation, squared_norm = normal_equations(rows, neighbours, directions, values)
-    assert gram.dtype == correlation.dtype == squared_norm.dtype == np.float32
+    assert gram.dtype == correlation.dtype == squared_norm.dtype == np.float64
     assert (gram.shape, correlation.shape, squared_norm.shape) == ((n, k, k), (n, k), (n,))
     for i in range(n):
         there, asked = neighbours[i] >= 0, directions[i] >= 0
