@@ -10,22 +10,20 @@ and interpolated along the surface: T_indirect = A D.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import numba
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.hashing import mix
-from mi_sparse_prt.matrix import Indirect, Interpolated, Visibility
-from mi_sparse_prt.methods.dense import Dense, DenseSampler, indirect_of
+from mi_sparse_prt.matrix import Interpolated, Visibility
+from mi_sparse_prt.methods.dense import Dense, DenseSampler
+from mi_sparse_prt.methods.indirect import indirect_part
+from mi_sparse_prt.methods.neighbourhoods import NEIGHBOURS, Neighbourhood, neighbourhoods
 from mi_sparse_prt.methods.parts import Parts
-from mi_sparse_prt.reconstruction.low_rank import denoised
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
+from mi_sparse_prt.reconstruction.neighbours import surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits, above_horizon, counts, listed, pack, scattered
+from mi_sparse_prt.sampling.bits import BITS, Bits, above_horizon, counts, listed, ones, overwrite, pack
 from mi_sparse_prt.sampling.features import contested
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -33,10 +31,7 @@ from mi_sparse_prt.transport.path import PathTransport
 
 DENSE = 0.2  # of the vertices of a mesh
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
-NEIGHBOURS = 12
-LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
 HELD_OUT = 16  # random directions per sparse vertex in a round of repair
-POOL = 32  # vertices whose held-out directions are judged together
 TOLERATED = 0.03  # relative L2 of a neighbourhood's direct light that is not repaired
 ROUNDS = 2
 
@@ -68,7 +63,7 @@ def sparse_parts(
     sampler = DenseSampler(scene, direct, grid, clock)
     for mesh in scene.meshes:
         sampler.choose(mesh, DENSE, RADIUS, seed)
-    dense, groups = _neighbourhoods(scene, sampler, clock)
+    dense, groups = neighbourhoods(scene, sampler, clock)
 
     state = _Visibility(direct, dense, clock)
     for group in groups:
@@ -77,54 +72,10 @@ def sparse_parts(
         for group in groups:
             state.repair(scene, group, (seed << 4) + number)
 
-    part = None
+    part, paths = None, 0
     if indirect is not None:
-        density = _indirect_rows(scene, indirect, dense, grid, clock, progress)
-        with clock.phase("solver"):
-            weights = _weights(scene, groups, dense)
-        part = Interpolated(Indirect(density, grid.upsampling, direct.lighting), weights)
-    return _account(scene, direct, indirect, dense, grid, state, part)
-
-
-@dataclass
-class _Neighbourhood:
-    """The sparse vertices (n_sparse,) of a mesh, and dense neighbours of all its vertices: indices into Dense."""
-
-    mesh: Mesh
-    sparse: NDArray[np.int64]
-    near: Neighbours
-
-    @property
-    def near_sparse(self) -> NDArray[np.int32]:
-        """Neighbours (n_sparse, k) of the sparse vertices."""
-        return self.near.ids[self.sparse - self.mesh.vertices.start]
-
-
-def _neighbourhoods(
-    scene: Scene, sampler: DenseSampler, clock: Stopwatch
-) -> tuple[Dense, list[_Neighbourhood]]:
-    """Dense neighbours of all sparse vertices; vertices with too few on their own surface become dense first."""
-    dense = sampler.dense()
-    with clock.phase("neighbours"):
-        groups = [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
-        few = [g.sparse[(g.near_sparse >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]
-    lonely = np.concatenate(few)
-    if not len(lonely):
-        return dense, groups
-    sampler.add(lonely)
-    dense = sampler.dense()
-    with clock.phase("neighbours"):
-        return dense, [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
-
-
-def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> _Neighbourhood:
-    chosen, inside = dense.of_mesh(mesh), mesh.vertices
-    own = dense.ids[chosen]
-    sparse = np.setdiff1d(np.arange(inside.start, inside.stop), own)
-    p, n = scene.normalised_positions, scene.normals
-    near = surface_neighbours(p[inside], n[inside], p[own], n[own], NEIGHBOURS)
-    ids = np.where(near.ids >= 0, chosen[near.ids], -1).astype(np.int32)
-    return _Neighbourhood(mesh, sparse, Neighbours(ids, near.distances))
+        part, paths = indirect_part(scene, indirect, dense, groups, state.evaluated, grid, clock, progress)
+    return _account(scene, direct, indirect, dense, grid, state, part, paths)
 
 
 class _Visibility:
@@ -144,7 +95,7 @@ class _Visibility:
             self.visible[dense.ids] = dense.rows.visible
             self.evaluated[dense.ids] = dense.rows.evaluated
 
-    def reconstruct(self, group: _Neighbourhood) -> None:
+    def reconstruct(self, group: Neighbourhood) -> None:
         """Rows of sparse vertices: what their neighbours agree on, and traced rays elsewhere."""
         rows = self._dense.rows
         with self._clock.phase("consensus"):
@@ -152,51 +103,49 @@ class _Visibility:
             self.visible[group.sparse] = agreed
             self._trace(group.sparse, differ)
 
-    def repair(self, scene: Scene, group: _Neighbourhood, seed: int) -> int:
-        """Look at random borrowed elements; where they are wrong too often, trace more. Returns repaired vertices.
+    def repair(self, scene: Scene, group: Neighbourhood, seed: int) -> None:
+        """Look at random borrowed elements; where they are wrong too often, trace more.
 
         What is traced are the directions in which the nearest of all vertices differ: they are nearer than the dense
         ones, and know more by now.
         """
         if not len(group.sparse):
-            return 0
+            return
         with self._clock.phase("repair"):
-            poor = group.sparse[self._pooled_error(scene, group, seed) > TOLERATED**2]
+            poor = group.sparse[self._pooled_error(group, seed) > TOLERATED**2]
             if not len(poor):
-                return 0
+                return
             inside, p, n = group.mesh.vertices, scene.normalised_positions, scene.normals
             near = surface_neighbours(p[poor], n[poor], p[inside], n[inside], NEIGHBOURS + 1)
             # the first neighbour is the vertex itself
             differ, _ = contested(near.ids[:, 1:], self.visible[inside], self.above[inside], self.above[poor])
             self._trace(poor, differ & ~self.evaluated[poor])
-        return len(poor)
 
-    def _pooled_error(self, scene: Scene, group: _Neighbourhood, seed: int) -> NDArray[np.float64]:
-        """Squared relative error of rows, (n,), from held-out elements of the nearest sparse vertices of each."""
-        texels = _random_texels(
-            self._direct.points.keys[group.sparse], seed, self._direct.lighting.n_directions
-        )
-        borrowed = self.above[group.sparse] & ~self.evaluated[group.sparse]
-        asked = borrowed & _as_bits(texels, borrowed.shape[1])
-        left = counts(borrowed)
-        tried, wrong = counts(asked), counts(self._trace(group.sparse, asked))
-        tree = cKDTree(scene.normalised_positions[group.sparse])
-        _, pool = tree.query(tree.data, min(POOL, len(group.sparse)), workers=-1)
-        pool = pool.reshape(len(group.sparse), -1)
-        seen = counts(self.visible[group.sparse])
-        rate = wrong[pool].sum(axis=1) / np.maximum(tried[pool].sum(axis=1), 1)
-        return rate * left[pool].sum(axis=1) / np.maximum(seen[pool].sum(axis=1), 1)
+    def _pooled_error(self, group: Neighbourhood, seed: int) -> NDArray[np.float64]:
+        """Squared relative error of rows, (n_sparse,), from held-out elements.
 
-    def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> Bits:
-        """Evaluate and keep elements; returns those that were not as borrowed before."""
+        Those of all vertices that have the same nearest dense vertex are pooled, and these of all dense neighbours.
+        """
+        sparse, near = group.sparse, group.near_sparse
+        texels = _random_texels(self._direct.points.keys[sparse], seed, self._direct.lighting.n_directions)
+        asked, left = _borrowed(self.above, self.evaluated, sparse, texels)
+        tried, wrong = counts(asked), self._trace(sparse, asked)
+        seen = counts(self.visible[sparse])
+
+        def pooled(values: NDArray[np.int64]) -> NDArray[np.float64]:
+            # one more for the padding, -1
+            cells = np.bincount(near[:, 0], weights=values, minlength=len(self._dense.ids) + 1)
+            return np.asarray(cells[near].sum(axis=1))
+
+        rate = pooled(wrong) / np.maximum(pooled(tried), 1)
+        return rate * pooled(left) / np.maximum(pooled(seen), 1)
+
+    def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> NDArray[np.int64]:
+        """Evaluate and keep elements (n, words); returns how many of each vertex were not as borrowed before."""
         ids, texels = listed(asked)
         with self._clock.phase("sparse_rays"):
             values = self._direct.visible(vertices[ids], texels)
-        seen = scattered(asked, values)
-        before = self.visible[vertices]
-        self.visible[vertices] = (before & ~asked) | seen
-        self.evaluated[vertices] |= asked
-        return (before ^ seen) & asked
+        return overwrite(self.visible, self.evaluated, vertices, asked, values)
 
 
 def _random_texels(keys: NDArray[np.uint64], seed: int, n_directions: int) -> NDArray[np.int64]:
@@ -205,51 +154,21 @@ def _random_texels(keys: NDArray[np.uint64], seed: int, n_directions: int) -> ND
     return (mix(mix(keys)[:, None] ^ salt) % np.uint64(n_directions)).astype(np.int64)
 
 
-def _as_bits(texels: NDArray[np.int64], words: int) -> Bits:
-    """Bits (n, words) with the listed texels (n, k) set."""
-    bits = np.zeros((len(texels), words), np.uint32)
-    for column in texels.T:
-        bits[np.arange(len(texels)), column >> 5] |= np.uint32(1) << (column & 31).astype(np.uint32)
-    return bits
-
-
-def _indirect_rows(
-    scene: Scene,
-    indirect: PathTransport,
-    dense: Dense,
-    grid: AngularGrid,
-    clock: Stopwatch,
-    progress: bool,
-) -> NDArray[np.float16]:
-    """Indirect light (n_dense, n_grid, channels) of the dense vertices on the quarter grid, freed of noise by mesh."""
-    density = np.empty((len(dense.ids), len(grid.texels), indirect.channels), np.float16)
-    for mesh in scene.meshes:
-        chosen = dense.of_mesh(mesh)
-        # by key: sums over rows then round alike in whatever order vertices come
-        chosen = chosen[np.argsort(indirect.points.keys[dense.ids[chosen]], kind="stable")]
-        with clock.phase("dense_paths"):
-            rows = indirect_of(indirect, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress)
-        with clock.phase("low_rank"):
-            for channel in range(indirect.channels):
-                density[chosen, :, channel] = denoised(rows.mean[..., channel], rows.variance[..., channel])[
-                    0
-                ]
-    return density
-
-
-def _weights(scene: Scene, groups: list[_Neighbourhood], dense: Dense) -> scipy.sparse.csr_array:
-    """A (n_v, n_dense): dense rows take part in their own smoothing, with their neighbours'."""
-    p, n = scene.normalised_positions, scene.normals
-    rows, columns, values = [], [], []
-    for group in groups:
-        inside, ids = group.mesh.vertices, group.near.ids
-        weights = linear_weights(group.near, p[inside], n[inside], p[dense.ids], n[dense.ids])
-        present = ids >= 0
-        rows.append(np.repeat(np.arange(inside.start, inside.stop), present.sum(axis=1)))
-        columns.append(ids[present].astype(np.int64))
-        values.append(weights[present])
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return scipy.sparse.coo_array(entries, shape=(len(p), len(dense.ids))).tocsr()
+@numba.njit(parallel=True, cache=True)
+def _borrowed(
+    above: Bits, evaluated: Bits, vertices: NDArray[np.int64], texels: NDArray[np.int64]
+) -> tuple[Bits, NDArray[np.int64]]:
+    """Bits (n, words) of those listed texels (n, k) of some vertices that were borrowed; and how many such all have."""
+    asked = np.zeros((len(vertices), above.shape[1]), np.uint32)
+    left = np.zeros(len(vertices), np.int64)
+    for i in numba.prange(len(vertices)):
+        v = vertices[i]
+        for w in range(above.shape[1]):
+            left[i] += ones(above[v, w] & ~evaluated[v, w])  # type: ignore[call-arg]  # numba gives the context
+        for j in texels[i]:
+            w = j // BITS
+            asked[i, w] |= (np.uint32(1) << np.uint32(j % BITS)) & above[v, w] & ~evaluated[v, w]
+    return asked, left
 
 
 def _account(
@@ -260,6 +179,7 @@ def _account(
     grid: AngularGrid,
     state: _Visibility,
     part: Interpolated | None,
+    paths: int,
 ) -> Parts:
     """The parts, and how many elements of each were evaluated."""
     quarter = np.zeros(direct.lighting.n_directions, bool)
@@ -267,7 +187,6 @@ def _account(
     either = counts(state.evaluated)
     if part is not None:
         either[dense.ids] = counts(state.evaluated[dense.ids] | pack(quarter))
-    paths = len(dense.ids) * len(grid.texels) if part is not None else 0
     rays = int(counts(state.evaluated).sum())
     parts = Parts(
         Visibility(state.visible, scene.normals, direct.lighting),

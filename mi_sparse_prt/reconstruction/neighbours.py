@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -160,25 +161,42 @@ def linear_weights(
     (n, k) float32
         0 where there is no neighbour.
     """
-    ids, present = np.maximum(neighbours.ids, 0), neighbours.ids >= 0
-    distances = np.where(present, neighbours.distances, 0)
-    reach = np.maximum(distances.max(axis=1, keepdims=True, initial=0) / GAUSSIANS, 1e-30)
-    near = np.where(present, np.exp(-((distances / reach) ** 2)), 0)  # [point, neighbour]
-    near /= np.maximum(near.sum(axis=1, keepdims=True), 1e-30)
-    step = np.maximum(reach / GAUSSIANS, 1e-30)[..., None]
-    terms = np.concatenate(
-        [
-            (dense_positions[ids] - positions[:, None]) / step,
-            (dense_normals[ids] - normals[:, None]) * NORMAL_UNIT,
-        ],
-        axis=2,
-    )  # [point, neighbour, slope]
-    mean = np.matmul(near[:, None], terms)[:, 0]  # [point, slope]
-    centred = terms - mean[:, None]
-    weighted = near[..., None] * centred
-    system = np.matmul(weighted.transpose(0, 2, 1), centred) + RIDGE * np.eye(terms.shape[2])
-    slopes = np.linalg.solve(system, mean[..., None])[..., 0]
-    return np.asarray(near - np.matmul(weighted, slopes[..., None])[..., 0], np.float32)
+    return _linear_weights(
+        neighbours.ids,
+        neighbours.distances,
+        np.hstack([positions, normals]),
+        np.hstack([dense_positions, dense_normals]),
+    )
+
+
+@numba.njit(parallel=True, cache=True)
+def _linear_weights(
+    ids: NDArray[np.int32],
+    distances: NDArray[np.float32],
+    points: NDArray[np.floating],
+    dense: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Of points (n, 6) and dense vertices (m, 6), each a position and a normal."""
+    weights = np.zeros(ids.shape, np.float32)
+    for i in numba.prange(len(ids)):
+        count = 0
+        while count < ids.shape[1] and ids[i, count] >= 0:
+            count += 1
+        if count == 0:
+            continue
+        reach = max(np.float64(distances[i, count - 1]) / GAUSSIANS, 1e-30)
+        near = np.exp(-((distances[i, :count] / reach) ** 2))
+        near /= near.sum()
+        terms = np.empty((count, 6))  # [neighbour, slope]
+        for k in range(count):
+            for c in range(6):
+                unit = max(reach / GAUSSIANS, 1e-30) if c < 3 else 1 / NORMAL_UNIT
+                terms[k, c] = (dense[ids[i, k], c] - points[i, c]) / unit
+        mean = near @ terms
+        weighted = (terms - mean) * near.reshape(-1, 1)
+        system = weighted.T @ (terms - mean) + RIDGE * np.eye(6)
+        weights[i, :count] = near - weighted @ np.linalg.solve(system, mean)
+    return weights
 
 
 def inverse_distance_weights(neighbours: Neighbours) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
-from mi_sparse_prt.sampling.bits import Bits, above_horizon, listed, pack, scattered
+from mi_sparse_prt.sampling.bits import BITS, Bits, above_horizon, listed, lowest, pack, scattered
 
 RADIUS = 3  # texels: windows of 7 x 7
 
@@ -80,7 +80,7 @@ class AngularGrid:
         above = above_horizon(normals, self.lighting.directions)
         first = above & pack(self._sampled)
         seen = scattered(first, visible(*listed(first)))
-        features, borrowed = _second_pass(first, seen, above, self.windows, self.lighting.n_directions)
+        features, borrowed = _second_pass(first, seen, above, *self._stamps)
         seen |= borrowed | scattered(features, visible(*listed(features)))
         return DenseRows(seen, first | features, features, above)
 
@@ -99,6 +99,23 @@ class AngularGrid:
         table[:, 1:][table[:, 1:] == table[:, :-1]] = -1  # beyond an edge two places can meet one texel
         table = np.sort(table, axis=1)[:, ::-1]
         return np.ascontiguousarray(table[:, : max(1, int((table >= 0).sum(axis=1).max()))], dtype=np.int32)
+
+    @cached_property
+    def _stamps(self) -> tuple[NDArray[np.int64], NDArray[np.int32], Bits]:
+        """The windows seen from the grid texels in them: a texel stamps its kind on words of bits.
+
+        Those of texel g are at ``starts[g]`` to ``starts[g + 1]``: (n_directions + 1,) starts, (m,) words and masks.
+        """
+        direction, place = np.nonzero(self.windows >= 0)
+        n_words = self.lighting.n_directions // BITS + 1
+        pairs, pair = np.unique(
+            self.windows[direction, place].astype(np.int64) * n_words + direction // BITS, return_inverse=True
+        )
+        masks = np.zeros(len(pairs), np.uint32)
+        np.bitwise_or.at(masks, pair, np.uint32(1) << (direction % BITS).astype(np.uint32))
+        texel, words = np.divmod(pairs, n_words)
+        starts = np.searchsorted(texel, np.arange(self.lighting.n_directions + 1))
+        return starts, words.astype(np.int32), masks
 
     @cached_property
     def upsampling(self) -> scipy.sparse.csr_array:
@@ -135,31 +152,32 @@ class AngularGrid:
 
 @numba.njit(parallel=True, cache=True)
 def _second_pass(
-    first: Bits, seen: Bits, above: Bits, windows: NDArray[np.int32], n_directions: int
+    first: Bits,
+    seen: Bits,
+    above: Bits,
+    starts: NDArray[np.int64],
+    stamp_words: NDArray[np.int32],
+    stamp_masks: Bits,
 ) -> tuple[Bits, Bits]:
     """Features (to be sampled) and borrowed visibility of the directions that the first pass left out.
 
     A window with no sampled direction above the horizon says nothing: its direction is sampled as well.
     """
-    features, borrowed = np.zeros_like(first), np.zeros_like(first)
-    one = np.uint32(1)
+    features, borrowed = np.empty_like(first), np.empty_like(first)
+    words = first.shape[1]
     for i in numba.prange(len(first)):
-        for j in range(n_directions):
-            word, bit = j >> 5, np.uint32(j & 31)
-            if not (above[i, word] >> bit) & one or (first[i, word] >> bit) & one:
-                continue
-            lit, dark = False, False
-            for k in range(windows.shape[1]):
-                g = windows[j, k]
-                if g < 0:
-                    break
-                if (first[i, g >> 5] >> np.uint32(g & 31)) & one:
-                    if (seen[i, g >> 5] >> np.uint32(g & 31)) & one:
-                        lit = True
-                    else:
-                        dark = True
-            if lit == dark:
-                features[i, word] |= one << bit
-            elif lit:
-                borrowed[i, word] |= one << bit
+        near = np.zeros((2, words), np.uint32)  # [dark or lit, word]
+        for w in range(words):
+            left = first[i, w]
+            while left:
+                bit = np.uint32(lowest(left))  # type: ignore[call-arg]  # numba gives the context
+                left &= left - np.uint32(1)
+                kind = (seen[i, w] >> bit) & np.uint32(1)
+                texel = w * BITS + np.int64(bit)
+                for q in range(starts[texel], starts[texel + 1]):
+                    near[kind, stamp_words[q]] |= stamp_masks[q]
+        for w in range(words):
+            dark, lit, asked = near[0, w], near[1, w], above[i, w] & ~first[i, w]
+            features[i, w] = asked & ~(dark ^ lit)
+            borrowed[i, w] = asked & lit & ~dark
     return features, borrowed

@@ -5,17 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numba
 import numpy as np
-from numba.core import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.reconstruction.neighbours import finite_rows, radius_neighbours
+from mi_sparse_prt.sampling.bits import ones
 
 ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its rank accounts for
 RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box
@@ -32,7 +30,7 @@ class SpatialSamples:
     ids : (n_dense,) int64
         Dense vertices, sorted.
     ranks : (n,) float32
-        Local rank of every vertex, from all dense vertices.
+        Local rank of every vertex, by which the last iteration was drawn; 0 where all were drawn at random.
     iterations : list of (n_i,) int64
         Vertices chosen in each iteration, sorted; together they are ``ids``.
     seconds : dict
@@ -58,8 +56,8 @@ def choose_dense(
 ) -> SpatialSamples:
     """Choose the dense vertices of one mesh in iterations, by the local rank of what is known so far ([HR10] 4.1).
 
-    The first iteration takes `step` of the vertices at random. Each later one computes the local rank of all
-    vertices and draws `step` more with the ranks as weights, until there are `fraction` of them.
+    The first iteration takes `step` of the vertices at random; they are the centres of local matrices. Each later one
+    computes the ranks of these and draws `step` more with the ranks as weights, until there are `fraction` of them.
 
     Parameters
     ----------
@@ -108,6 +106,12 @@ def choose_dense(
     seconds = {"rank": 0.0, "choice": 0.0}
     while True:
         start = time.perf_counter()
+        if len(dense):
+            known = np.concatenate(bits) if bits else np.zeros((0, 1), np.uint32)
+            weights = local_ranks_of_vertices(p, known, p[np.concatenate(dense)], p[dense[0]], radius, k)
+        seconds["rank"] += time.perf_counter() - start
+
+        start = time.perf_counter()
         left = np.flatnonzero(free)
         wanted = min(_share(step, n), total - (n - len(left)))
         new = left[weighted_choice(weights[left], names[left], wanted, _nth_seed(seed, len(dense)))]
@@ -118,13 +122,9 @@ def choose_dense(
         if len(new):
             bits.append(visibility(by_key[new]))
 
-        start = time.perf_counter()
         ranks = np.zeros(n, np.float32)
-        if bits:
-            weights = local_ranks_of_vertices(p, np.concatenate(bits), p[np.concatenate(dense)], radius, k)
+        if len(dense) > 1:
             ranks[by_key] = weights
-        seconds["rank"] += time.perf_counter() - start
-
         iterations = [np.sort(by_key[ids]) for ids in dense]
         samples = SpatialSamples(np.sort(by_key[~free]), ranks, iterations, dict(seconds))
         if len(samples.ids) >= total or (stop is not None and stop(samples)):
@@ -175,12 +175,13 @@ def local_ranks_of_vertices(
     positions: NDArray[np.floating],
     bits: NDArray[np.uint32],
     dense_positions: NDArray[np.floating],
+    centres: NDArray[np.floating],
     radius: float,
     k: int,
 ) -> NDArray[np.float32]:
     """Local rank at every vertex: that of the up to k nearest dense rows within the radius ([HR10] 4.1).
 
-    Matrices are shared: they are built at the dense vertices, and a vertex takes the rank of the nearest of them.
+    Matrices are shared: they are built around a few centres, and a vertex takes the rank of the nearest of them.
 
     Parameters
     ----------
@@ -188,6 +189,7 @@ def local_ranks_of_vertices(
     bits : (n_dense, words) uint32
         Visibility rows of the dense vertices: bit ``j % 32`` of word ``j // 32``.
     dense_positions : (n_dense, 3) float, same frame
+    centres : (m, 3) float, same frame
     radius : float
     k : int
 
@@ -205,8 +207,8 @@ def local_ranks_of_vertices(
         raise PrtError(f"{len(dense_positions)} dense vertices have {len(bits)} rows of bits: give one each")
     if not len(bits):
         return np.zeros(len(positions), np.float32)
-    ranks = local_rank(bits, radius_neighbours(dense_positions, dense_positions, radius, k).ids)
-    owner = radius_neighbours(positions, dense_positions, np.inf, 1).ids[:, 0]
+    ranks = local_rank(bits, radius_neighbours(centres, dense_positions, radius, k).ids)
+    owner = radius_neighbours(positions, centres, np.inf, 1).ids[:, 0]
     return ranks[owner].astype(np.float32)
 
 
@@ -263,7 +265,7 @@ def _gram(words: NDArray[np.uint64], rows: NDArray[np.int64]) -> NDArray[np.floa
             b = words[rows[j]]
             shared = np.uint64(0)
             for w in range(len(a)):
-                shared += _popcount(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
+                shared += ones(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
             gram[i, j] = gram[j, i] = shared
     return gram
 
@@ -277,16 +279,6 @@ def _count_largest(ascending: NDArray[np.floating]) -> int:
         count += 1
         missing -= ascending[-count]
     return count
-
-
-@intrinsic
-def _popcount(typingctx: Any, word: Any) -> Any:
-    """Bits set in a uint64: LLVM's own instruction, which vectorises."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.uint64(types.uint64), generate
 
 
 def _share(fraction: float, n: int) -> int:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.sampling.bits import above_horizon, counts, listed, pack, scattered, unpack
+from mi_sparse_prt.sampling.bits import above_horizon, counts, listed, overwrite, pack, scattered, unpack
 
 MASKS = st.tuples(st.integers(0, 5), st.integers(0, 100)).flatmap(lambda shape: arrays(bool, shape))
 
@@ -120,3 +120,21 @@ def test_no_rows():
     assert [len(x) for x in listed(empty)] == [0, 0]
     assert scattered(empty, np.zeros(0, bool)).shape == (0, 3)
     assert above_horizon(np.zeros((0, 3), np.float32), unit(40)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("n", [1, 31, 32, 100])
+def test_overwrite(n):
+    """Masked bits of some rows take the listed values and are known; nothing else changes; changes are counted."""
+    rng = np.random.default_rng(n)
+    bits, known, rows = rng.random((7, n)) < 0.5, rng.random((7, n)) < 0.5, np.array([5, 0, 3])
+    mask = rng.random((3, n)) < 0.4
+    values = rng.random(int(mask.sum())) < 0.5
+    expected, after, expected_known = bits.copy(), np.zeros((3, n), bool), known.copy()
+    after[mask] = values
+    expected[rows] = np.where(mask, after, bits[rows])
+    expected_known[rows] |= mask
+    packed, packed_known = pack(bits), pack(known)
+    changed = overwrite(packed, packed_known, rows, pack(mask), values)
+    assert np.array_equal(unpack(packed, n), expected)
+    assert np.array_equal(unpack(packed_known, n), expected_known)
+    assert changed.tolist() == ((after != bits[rows]) & mask).sum(axis=1).tolist()

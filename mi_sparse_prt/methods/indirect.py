@@ -1,0 +1,225 @@
+"""Indirect light of ``method="sparse"``: T = A D, smooth, so that few rows and few directions of these suffice.
+
+D, the dense rows, are path traced on a quarter of the directions and freed of noise by their low rank. A interpolates
+them along the surface; where a few samples at sparse vertices show that to be worth it, they correct it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.hashing import mix
+from mi_sparse_prt.matrix import Indirect, Interpolated
+from mi_sparse_prt.methods.dense import Dense, indirect_of
+from mi_sparse_prt.methods.neighbourhoods import Neighbourhood
+from mi_sparse_prt.reconstruction.low_rank import denoised
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights
+from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
+from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.bits import Bits, listed, pack
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.path import PathTransport
+
+NEIGHBOURS = 8
+PILOT = 512  # sparse vertices of a mesh that tell whether samples help
+BLOCK = 4096  # sparse vertices at a time
+
+
+def indirect_part(
+    scene: Scene,
+    solver: PathTransport,
+    dense: Dense,
+    groups: list[Neighbourhood],
+    evaluated: Bits,
+    grid: AngularGrid,
+    clock: Stopwatch,
+    progress: bool,
+) -> tuple[Interpolated, int]:
+    """Evaluate and reconstruct indirect light.
+
+    Parameters
+    ----------
+    scene : Scene
+    solver : PathTransport
+        At the scene's vertices and the full resolution of the lighting.
+    dense : Dense
+    groups : list of Neighbourhood
+        One per mesh.
+    evaluated : (n_v, words) uint32 bits
+        Elements that were evaluated for direct light. Sparse vertices sample indirect light in some of them.
+    grid : AngularGrid
+    clock : Stopwatch
+        Phases ``dense_paths``, ``low_rank``, ``sparse_paths``, ``system``, ``solver``.
+    progress : bool
+
+    Returns
+    -------
+    Interpolated, int
+        The part, and how many of its elements were evaluated.
+    """
+    density, noise = _dense_rows(scene, solver, dense, grid, clock, progress)
+    fit = _Fit(solver, density, noise, evaluated, grid, clock)
+    rows, columns, values = [], [], []
+    for group in groups:
+        with clock.phase("solver"):
+            near, prior = _prior(scene, group, dense)
+        weights = fit.corrected(group, near, prior, progress)
+        present = near.ids >= 0
+        inside = group.mesh.vertices
+        rows.append(np.repeat(np.arange(inside.start, inside.stop), present.sum(axis=1)))
+        columns.append(near.ids[present].astype(np.int64))
+        values.append(weights[present].astype(np.float32))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    weights = scipy.sparse.coo_array(entries, shape=(len(scene.positions), len(dense.ids))).tocsr()
+    factor = Indirect(density.astype(np.float16), grid.upsampling, solver.lighting)
+    return Interpolated(factor, weights), len(dense.ids) * len(grid.texels) + fit.elements
+
+
+def _dense_rows(
+    scene: Scene, solver: PathTransport, dense: Dense, grid: AngularGrid, clock: Stopwatch, progress: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Indirect light (n_dense, n_grid, channels) of the dense vertices on the quarter grid, freed of noise by mesh.
+
+    And the mean variance of an element's estimate in each row, (n_dense,).
+    """
+    density = np.empty((len(dense.ids), len(grid.texels), solver.channels), np.float32)
+    noise = np.empty(len(dense.ids))
+    for mesh in scene.meshes:
+        chosen = dense.of_mesh(mesh)
+        # by key: sums over rows then round alike in whatever order vertices come
+        chosen = chosen[np.argsort(solver.points.keys[dense.ids[chosen]], kind="stable")]
+        with clock.phase("dense_paths"):
+            rows = indirect_of(solver, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress)
+        with clock.phase("low_rank"):
+            noise[chosen] = rows.variance.mean(axis=(1, 2))
+            for c in range(solver.channels):
+                mean = rows.mean[..., c]
+                density[chosen, :, c] = _with_sums_of(mean, denoised(mean, rows.variance[..., c])[0])
+    return density, noise
+
+
+def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Add to each row what its sum lacks, in the proportions of the mean row.
+
+    Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: even light stays unbiased.
+    """
+    mean, lacking = shrunk.mean(axis=0), (rows - shrunk).sum(axis=1)
+    total = float(mean.sum())
+    return shrunk + lacking[:, None] * (mean / total) if total > 0 else shrunk
+
+
+def _prior(scene: Scene, group: Neighbourhood, dense: Dense) -> tuple[Neighbours, NDArray[np.float32]]:
+    """Neighbours and weights (n, k) of all vertices of a mesh; dense rows are smoothed by their neighbours'."""
+    p, n, inside = scene.normalised_positions, scene.normals, group.mesh.vertices
+    near = Neighbours(group.near.ids[:, :NEIGHBOURS], group.near.distances[:, :NEIGHBOURS])
+    return near, linear_weights(near, p[inside], n[inside], p[dense.ids], n[dense.ids])
+
+
+class _Fit:
+    """Corrects the weights of sparse vertices by samples of their own.
+
+    Parameters
+    ----------
+    density : (n_dense, n_grid, channels) float32
+        D.
+    noise : (n_dense,) float64
+        Mean variance of a row's elements. Samples are trusted by that of the dense neighbours: few samples which are
+        too dark by chance have too small a variance of their own, and would count for more than those too bright.
+    evaluated : bits
+        Of these elements, those on the grid are path traced: no others are evaluated for it.
+
+    Attributes
+    ----------
+    elements : int
+        That were path traced.
+    """
+
+    def __init__(
+        self,
+        solver: PathTransport,
+        density: NDArray[np.float32],
+        noise: NDArray[np.float64],
+        evaluated: Bits,
+        grid: AngularGrid,
+        clock: Stopwatch,
+    ) -> None:
+        self._solver, self._noise, self._evaluated, self._clock = solver, noise, evaluated, clock
+        self._rows = np.ascontiguousarray(
+            np.moveaxis(density, 2, 0)
+        )  # [channel, dense vertex, place on the grid]
+        self._place = np.full(solver.lighting.n_directions, -1, np.int32)
+        self._place[grid.texels] = np.arange(len(grid.texels), dtype=np.int32)
+        self.elements = 0
+
+    def corrected(
+        self, group: Neighbourhood, near: Neighbours, prior: NDArray[np.float32], progress: bool
+    ) -> NDArray[np.float32]:
+        """Weights (n, k) of all vertices of a mesh."""
+        weights, start = prior.copy(), group.mesh.vertices.start
+        order = np.argsort(mix(self._solver.points.keys[group.sparse]), kind="stable")
+        pilot = np.sort(group.sparse[order[:PILOT]])
+        halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start])
+        with self._clock.phase("solver"):
+            deviation = best_deviation(halves, noise)
+        if deviation == 0:
+            return weights
+        for ids in self._batches(group, pilot, progress):
+            if ids is not pilot:
+                halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start])
+            with self._clock.phase("solver"):
+                weights[ids - start] += correction(halves[0] + halves[1], noise, deviation).astype(np.float32)
+        return weights
+
+    @staticmethod
+    def _batches(
+        group: Neighbourhood, pilot: NDArray[np.int64], progress: bool
+    ) -> Iterator[NDArray[np.int64]]:
+        """The pilot, and all other sparse vertices of a mesh in their order."""
+        others = np.setdiff1d(group.sparse, pilot)
+        yield pilot
+        for a in tqdm(range(0, len(others), BLOCK), f"sparse {group.mesh.name}", disable=not progress):
+            yield others[a : a + BLOCK]
+
+    def _sampled(
+        self, ids: NDArray[np.int64], near: NDArray[np.int32], prior: NDArray[np.float32]
+    ) -> tuple[tuple[System, System], NDArray[np.float64]]:
+        """Systems of the even and the odd samples of some vertices, and the noise of one sample of each, (n,)."""
+        with self._clock.phase("system"):
+            rows, texels = listed(self._evaluated[ids] & pack(self._place >= 0))
+        with self._clock.phase("sparse_paths"):
+            found = self._solver.elements(ids[rows].astype(np.uint32), texels)
+        self.elements += len(rows)
+        with self._clock.phase("system"):
+            count = np.bincount(rows, minlength=len(ids))
+            at = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+            directions = np.full((len(ids), max(2, int(count.max(initial=0)))), -1, np.int32)
+            directions[rows, at] = self._place[texels]
+            values = np.zeros((self._solver.channels, *directions.shape), np.float32)
+            values[:, rows, at] = found.mean.T
+            present = near >= 0
+            noise = (self._noise[near] * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
+            halves = [self._system(directions[:, k::2], values[:, :, k::2], near, prior) for k in (0, 1)]
+        return (halves[0], halves[1]), noise
+
+    def _system(
+        self,
+        directions: NDArray[np.int32],
+        values: NDArray[np.float32],
+        near: NDArray[np.int32],
+        prior: NDArray[np.float32],
+    ) -> System:
+        """Channels share the weights: their systems add up."""
+        taken, a = np.ascontiguousarray(directions), prior.astype(np.float64)
+        count = (taken >= 0).sum(axis=1)
+        systems = [
+            about(a, *normal_equations(rows, near, taken, np.ascontiguousarray(y)), count)
+            for rows, y in zip(self._rows, values, strict=True)
+        ]
+        return sum(systems[1:], systems[0])

@@ -1,0 +1,57 @@
+"""Sparse vertices and the dense vertices beside them on their own surface ([HR10] 5.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.methods.dense import Dense, DenseSampler
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, surface_neighbours
+from mi_sparse_prt.scene import Mesh, Scene
+
+NEIGHBOURS = 12
+LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
+
+
+@dataclass
+class Neighbourhood:
+    """The sparse vertices (n_sparse,) of a mesh, and dense neighbours of all its vertices: indices into Dense."""
+
+    mesh: Mesh
+    sparse: NDArray[np.int64]
+    near: Neighbours
+
+    @property
+    def near_sparse(self) -> NDArray[np.int32]:
+        """Neighbours (n_sparse, k) of the sparse vertices."""
+        return self.near.ids[self.sparse - self.mesh.vertices.start]
+
+
+def neighbourhoods(
+    scene: Scene, sampler: DenseSampler, clock: Stopwatch
+) -> tuple[Dense, list[Neighbourhood]]:
+    """Dense neighbours of all sparse vertices; vertices with too few on their own surface become dense first."""
+    dense = sampler.dense()
+    with clock.phase("neighbours"):
+        groups = [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
+        few = [g.sparse[(g.near_sparse >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]
+    lonely = np.concatenate(few)
+    if not len(lonely):
+        return dense, groups
+    sampler.add(lonely)
+    dense = sampler.dense()
+    with clock.phase("neighbours"):
+        return dense, [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
+
+
+def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> Neighbourhood:
+    chosen, inside = dense.of_mesh(mesh), mesh.vertices
+    own = dense.ids[chosen]
+    sparse = np.setdiff1d(np.arange(inside.start, inside.stop), own)
+    p, n = scene.normalised_positions, scene.normals
+    near = surface_neighbours(p[inside], n[inside], p[own], n[own], NEIGHBOURS)
+    ids = np.where(near.ids >= 0, chosen[near.ids], -1).astype(np.int32)
+    return Neighbourhood(mesh, sparse, Neighbours(ids, near.distances))
