@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Visibility
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense import DenseSampler
 from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS
@@ -28,7 +28,7 @@ from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 
 CURVES = {"least_squares": "least squares", "l1": "L1", "full": "full: least squares on all directions"}
-GRAM_ELEMENTS = 1 << 22  # of the Gram matrices that are solved together: 16 MB, and as float64 in the solvers
+GRAM_ELEMENTS = 1 << 22  # of the Gram matrices that are solved together: 32 MB
 MOST_TOGETHER = 64  # vertices
 
 
@@ -43,6 +43,10 @@ class _Samples:
     exact, dense : (n, n_directions), (n_dense, n_directions) float32
         White direct transport.
     features : (n_dense, words) uint32 bits
+    products : (n_dense, n_dense) float64
+        Of dense rows, over all directions: every Gram matrix of a fit to all of them is a part of it.
+    projections : (n, n_dense) float64
+        Products of exact and dense rows.
     """
 
     positions: NDArray[np.float32]
@@ -50,6 +54,8 @@ class _Samples:
     dense_positions: NDArray[np.float32]
     dense: NDArray[np.float32]
     features: Bits
+    products: NDArray[np.float64]
+    projections: NDArray[np.float64]
 
 
 def error_against_radius(
@@ -79,7 +85,7 @@ def error_against_radius(
     n_vertices : int
         Size of the sample; all sparse vertices if there are fewer.
     directions : int
-        Feature directions per vertex, at most.
+        Feature directions per vertex, at most: a small radius has fewer ([HR10] 5.3).
     relative_lambda : float
         Of the L1 fit; see ``l1_fit``.
     seed : int
@@ -102,14 +108,12 @@ def error_against_radius(
 
     Notes
     -----
-    The Gram matrices are float32, so both least-squares curves leave out what is below 1e-7 k of the largest
-    eigenvalue (``least_squares_fit``): they overfit less than an exact solution does.
+    Gram matrices are float64, and eigenvalues below k eps of the largest carry no weight (``least_squares_fit``). In
+    float32 that regularises so much that least squares does not overfit, and that ``full`` gets worse with the
+    radius. The products of all dense rows are kept: O(n_dense^2) memory.
     """
     _check(radii, n_vertices, directions)
-    mesh = next((m for m in scene.meshes if m.name == mesh_name), None)
-    if mesh is None:
-        names = ", ".join(m.name for m in scene.meshes)
-        raise PrtError(f"the scene has no mesh {mesh_name!r}: choose one of {names}")
+    mesh = mesh_named(scene, mesh_name)
     samples = _sampled(scene, lighting, mesh, n_vertices, seed)
     report: dict[str, Any] = {
         "scene": scene.path,
@@ -146,10 +150,11 @@ def plot_error_against_radius(report: dict[str, Any]) -> Figure:
         right.plot(report["radii"], report["weights"][curve], ".-", color=colour, label=f"weights, {label}")
     right.plot(report["radii"], report["neighbours"], "k:", label="neighbours")
     right.plot(report["radii"], report["directions"], "--", color="grey", label="sampled directions")
+    top = 1.4 * 100 * max(max(errors) for errors in report["error"].values())  # room for the legend
     left.set(
         xlabel="radius / longest side of the scene",
         ylabel="relative L2 of the rows (%)",
-        ylim=(0, None),
+        ylim=(0, top),
         title=f"{report['mesh']}: error",
     )
     right.set(
@@ -158,7 +163,7 @@ def plot_error_against_radius(report: dict[str, Any]) -> Figure:
         yscale="symlog",
         title=f"{report['mesh']}: size of the systems",
     )
-    left.legend()
+    left.legend(loc="upper right")
     right.legend(fontsize="small")
     return figure
 
@@ -182,26 +187,18 @@ def _sampled(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: in
     if not len(others):
         raise PrtError(f"all vertices of the mesh {mesh.name!r} are dense: it is too small for this")
     sparse = others[weighted_choice(np.ones(len(others)), points.keys[others], n_vertices, seed)]
-    traced = [
-        direct.rows(sparse[a : a + direct.block_size]) for a in range(0, len(sparse), direct.block_size)
-    ]
+    exact = white_rows(traced_rows(direct, sparse), scene.normals[sparse], lighting)
+    rows = white_rows(dense.rows.visible, scene.normals[dense.ids], lighting)
+    precise = rows.astype(np.float64)
     return _Samples(
         scene.normalised_positions[sparse],
-        _rows(np.concatenate(traced), scene.normals[sparse], lighting),
+        exact,
         scene.normalised_positions[dense.ids],
-        _rows(dense.rows.visible, scene.normals[dense.ids], lighting),
+        rows,
         dense.rows.features,
+        precise @ precise.T,
+        exact.astype(np.float64) @ precise.T,
     )
-
-
-def _rows(bits: Bits, normals: NDArray[np.float32], lighting: CubemapLighting) -> NDArray[np.float32]:
-    """White direct transport (n, n_directions) of visibility bits, in blocks."""
-    rows = np.empty((len(bits), lighting.n_directions), np.float32)
-    visibility = Visibility(bits, normals, lighting)
-    for a in range(0, len(rows), 256):
-        ids = np.arange(a, min(a + 256, len(rows)))
-        rows[ids] = visibility.rows(ids)[..., 0]
-    return rows
 
 
 def _at_radius(
@@ -268,7 +265,17 @@ def _fits(
     exact = samples.exact[ids]
     sampled = np.where(chosen >= 0, np.take_along_axis(exact, np.maximum(chosen, 0), axis=1), np.float32(0))
     few = normal_equations(samples.dense, near, chosen, sampled)
-    every = np.broadcast_to(np.arange(exact.shape[1], dtype=np.int32), exact.shape)
-    full = normal_equations(samples.dense, near, np.ascontiguousarray(every), exact)
+    full = _all_directions(samples, ids, near)
     fits = (least_squares_fit(*few), l1_fit(*few, relative_lambda), least_squares_fit(*full))
     return np.stack([fit.weights for fit in fits], axis=1)
+
+
+def _all_directions(
+    samples: _Samples, ids: NDArray[np.int64], near: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """As ``normal_equations`` of vertices ``ids`` (n,) and neighbours (n, k), with all directions."""
+    present, columns = near >= 0, np.maximum(near, 0)
+    gram = samples.products[columns[:, :, None], columns[:, None, :]]
+    gram *= present[:, :, None] & present[:, None, :]
+    correlation = np.take_along_axis(samples.projections[ids], columns, axis=1) * present
+    return gram, correlation, (samples.exact[ids].astype(np.float64) ** 2).sum(axis=1)

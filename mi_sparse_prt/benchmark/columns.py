@@ -1,0 +1,188 @@
+"""Columns of a local transport matrix chosen once for all rows of a region, as others than [HR10] do.
+
+All take the region's dense rows, whose columns (one value per dense vertex) they compare, and a random generator.
+Columns of zeros are left out: they say nothing about weights, and [HPB07] ignores them as well.
+
+[HPB07] Hasan, Pellacini, Bala: Matrix Row-Column Sampling for the Many-Light Problem, 2007.
+[WDT09] Wang, Dong, Tong, Lin, Guo: Kernel Nystroem Method for Light Transport, 2009.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+Ids = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+BY_SAMPLING = 2 / 3  # of the clusters; the others are made by splitting ([HPB07] 3.5)
+LLOYD_STEPS = 10
+
+
+def random_columns(rows: NDArray[np.float32], count: int, rng: np.random.Generator) -> Ids:
+    """Columns at random.
+
+    Parameters
+    ----------
+    rows : (r, n_directions) float32
+    count : int
+    rng : np.random.Generator
+
+    Returns
+    -------
+    (min(count, columns that are not zero),) int64
+        Ascending.
+    """
+    ids = np.flatnonzero(rows.any(axis=0))
+    return np.sort(rng.choice(ids, min(count, len(ids)), replace=False))
+
+
+def clustered_columns(rows: NDArray[np.float32], count: int, rng: np.random.Generator) -> Ids:
+    """One column of each cluster of columns of like direction, by the norms in it ([HPB07] 3.3 to 3.5).
+
+    The cost of a cluster is the sum of ``|x| |y| (1 - cos(x, y))`` over its pairs. Two thirds of the clusters have
+    centres drawn by what a column costs beside all others; then the dearest one is split until there are enough.
+
+    Parameters
+    ----------
+    rows : (r, n_directions) float32
+        The paper's reduced columns are its columns.
+    count : int
+        Clusters.
+    rng : np.random.Generator
+
+    Returns
+    -------
+    (min(count, columns that are not zero),) int64
+        Ascending.
+    """
+    ids, x = _not_zero(rows)
+    norms = np.linalg.norm(x, axis=1)
+    count = min(count, len(ids))
+    clusters = _clusters_by_sampling(x, norms, min(count, max(1, round(BY_SAMPLING * count))), rng)
+    costs = [_cost(x[members], norms[members]) for members in clusters]
+    while len(clusters) < count:
+        dearest = int(np.argmax(costs))
+        pieces = _split(x, norms, clusters.pop(dearest), rng)
+        costs.pop(dearest)
+        clusters.extend(pieces)
+        costs.extend(_cost(x[members], norms[members]) for members in pieces)
+    chosen = [rng.choice(members, p=norms[members] / norms[members].sum()) for members in clusters]
+    return np.sort(ids[np.array(chosen, np.int64)])
+
+
+def k_means_columns(rows: NDArray[np.float32], count: int, rng: np.random.Generator) -> Ids:
+    """The column nearest to each centre of a k-means clustering, as [HR10] 5.2 describes the choice of [WDT09].
+
+    Parameters
+    ----------
+    rows : (r, n_directions) float32
+    count : int
+        Centres: k-means++, then 10 steps of Lloyd. Clusters that stay empty (equal columns) give their place to the
+        columns that are farthest from their own centre.
+    rng : np.random.Generator
+
+    Returns
+    -------
+    (min(count, columns that are not zero),) int64
+        Ascending.
+    """
+    ids = np.flatnonzero(rows.any(axis=0))
+    x = np.ascontiguousarray(rows[:, ids].T, dtype=np.float32)  # [column, row]
+    count = min(count, len(ids))
+    if not count:
+        return ids
+    centres = x[_k_means_start(x, count, rng)]
+    for _ in range(LLOYD_STEPS):
+        owner = np.argmin(_squared_distances(x, centres), axis=1)
+        members = scipy.sparse.csr_array((np.ones(len(x), np.float32), (owner, np.arange(len(x)))))
+        sums, size = members @ x, members.sum(axis=1)  # up to the last cluster that is not empty
+        centres[: len(size)][size > 0] = sums[size > 0] / size[size > 0, None]
+    squared = _squared_distances(x, centres)
+    owner, distance = np.argmin(squared, axis=1), np.min(squared, axis=1)
+    order = np.lexsort((distance, owner))
+    nearest = order[np.unique(owner[order], return_index=True)[1]]
+    distance[nearest] = -1
+    farthest = np.argsort(-distance, kind="stable")
+    return np.sort(ids[np.concatenate([nearest, farthest[: count - len(nearest)]])])
+
+
+def _not_zero(rows: NDArray[np.float32]) -> tuple[Ids, Floats]:
+    """Columns that are not zero: their ids (n,) and values (n, r)."""
+    ids = np.flatnonzero(rows.any(axis=0))
+    return ids, np.ascontiguousarray(rows[:, ids].T, dtype=np.float64)
+
+
+# -- clustering by direction [HPB07] -----------------------------------------------------------------------------------
+
+
+def _clusters_by_sampling(x: Floats, norms: Floats, count: int, rng: np.random.Generator) -> list[Ids]:
+    """Columns (n, r) to the nearest of `count` centres, whose norms are scaled by how unlikely they were drawn."""
+    if not count:
+        return []
+    alpha = np.maximum(norms * norms.sum() - x @ x.sum(axis=0), 0)  # cost of a column beside all others
+    p = alpha / alpha.sum() if alpha.any() else np.full(len(x), 1 / len(x))
+    centres, times = _drawn(p, count, rng)
+    distance = norms[:, None] * norms[centres] - x @ x[centres].T  # [column, centre]
+    owner = np.argmin(np.maximum(distance, 0) * (times / p[centres]), axis=1)
+    owner[centres] = np.arange(len(centres))  # where rounding, or a parallel centre, would leave one empty
+    return [np.flatnonzero(owner == k) for k in range(len(centres))]
+
+
+def _drawn(p: Floats, count: int, rng: np.random.Generator) -> tuple[Ids, Ids]:
+    """Items drawn with probabilities p, with replacement, until `count` are distinct; and how often each came.
+
+    In continuous time, at rates p: when an item first comes is an exponential number, and how often it comes again
+    before the last one does is a Poisson number.
+    """
+    first = np.full(len(p), np.inf)
+    np.divide(rng.exponential(size=len(p)), p, out=first, where=p > 0)
+    items = np.argsort(first, kind="stable")[: min(count, int((p > 0).sum()))]
+    return items, 1 + rng.poisson(p[items] * (first[items[-1]] - first[items]))
+
+
+def _cost(x: Floats, norms: Floats) -> float:
+    """Cost of a cluster of columns (n, r); -1 where there is nothing to split."""
+    return float(_costs_of_first(x, norms)[-1]) if len(x) > 1 else -1.0
+
+
+def _costs_of_first(x: Floats, norms: Floats) -> Floats:
+    """Costs (n,) of the clusters of the first 1, 2, ..., n columns."""
+    cost = np.cumsum(norms) ** 2 - (np.cumsum(x, axis=0) ** 2).sum(axis=1)
+    return np.maximum(np.asarray(cost, np.float64), 0)
+
+
+def _split(x: Floats, norms: Floats, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
+    """A cluster of two or more, cut at the best place along a random line of directions."""
+    along = x[members] @ rng.normal(size=x.shape[1]) / norms[members]
+    ordered = members[np.argsort(along, kind="stable")]
+    before = _costs_of_first(x[ordered], norms[ordered])[:-1]
+    after = _costs_of_first(x[ordered[::-1]], norms[ordered[::-1]])[:-1][::-1]
+    cut = 1 + int(np.argmin(before + after))
+    return ordered[:cut], ordered[cut:]
+
+
+# -- k-means -----------------------------------------------------------------------------------------------------------
+
+
+def _k_means_start(x: Singles, count: int, rng: np.random.Generator) -> list[int]:
+    """k-means++: each centre is drawn by the squared distance to those before it (Arthur and Vassilvitskii 2007)."""
+    chosen = [int(rng.integers(len(x)))]
+    nearest, squares = np.full(len(x), np.inf, np.float32), (x**2).sum(axis=1)
+    while len(chosen) < count:
+        last = chosen[-1]
+        nearest = np.minimum(nearest, np.maximum(squares - 2 * (x @ x[last]) + squares[last], 0))
+        nearest[last] = 0
+        total = nearest.sum(dtype=np.float64)
+        chosen.append(int(rng.choice(len(x), p=nearest / total) if total > 0 else rng.integers(len(x))))
+    return chosen
+
+
+def _squared_distances(x: Singles, centres: Singles) -> Singles:
+    """Squared distances (n, k) of points (n, r) and centres (k, r)."""
+    squares = x @ (-2 * centres.T)  # a large array: everything else happens in its place
+    squares += (x**2).sum(axis=1)[:, None]
+    squares += (centres**2).sum(axis=1)
+    return np.maximum(squares, 0, out=squares)

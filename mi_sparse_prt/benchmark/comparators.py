@@ -1,0 +1,352 @@
+"""Which rows and columns to evaluate: the choices of [HR10] against others at the same budget (Figure 5)."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.benchmark.columns import clustered_columns, k_means_columns, random_columns
+from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.methods.huang2010 import LEAST_NEIGHBOURS, MOST_NEIGHBOURS, RADIUS, RELATIVE_LAMBDA
+from mi_sparse_prt.reconstruction.l1 import l1_fit
+from mi_sparse_prt.reconstruction.neighbours import (
+    inverse_distance_weights,
+    linear_weights,
+    radius_neighbours,
+    surface_neighbours,
+)
+from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.bits import Bits
+from mi_sparse_prt.sampling.features import best_features
+from mi_sparse_prt.sampling.spatial import choose_dense, weighted_choice
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+
+ROWS, COLUMNS = 0.25, 0.06  # Figure 5
+REGION = 1000  # vertices of a region that shares its columns, on average
+INTERPOLATED_FROM = 12  # neighbours, as many as method="sparse" has
+
+FITTED = {
+    "features": "rows by rank, columns by features [HR10]",
+    "clustered_columns": "clustered columns [HPB07]",
+    "k_means_columns": "k-means columns [WDT09]",
+    "random_columns": "random columns",
+    "random_rows": "random rows, columns by features",
+}
+INTERPOLATED = {
+    "nearest": "nearest dense vertex",
+    "inverse_distance": "inverse distance",
+    "linear": "linear (moving least squares)",
+}
+BY_REGION = {
+    "clustered_columns": clustered_columns,
+    "k_means_columns": k_means_columns,
+    "random_columns": random_columns,
+}
+
+Columns = Callable[[NDArray[np.float32], int, np.random.Generator], NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Exact direct light of a mesh; vertices are numbered from 0.
+
+    Attributes
+    ----------
+    positions, normals : (n, 3) float32, longest side of the scene = 1
+    keys : (n,) uint64
+    bits : (n, words) uint32
+    lighting : CubemapLighting
+    """
+
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    keys: NDArray[np.uint64]
+    bits: Bits
+    lighting: CubemapLighting
+
+    def rows(self, ids: NDArray[np.integer]) -> NDArray[np.float32]:
+        """White rows (len(ids), n_directions)."""
+        return white_rows(self.bits[ids], self.normals[ids], self.lighting)
+
+    def features(self, ids: NDArray[np.integer]) -> Bits:
+        """Directions that the second angular pass would add at these vertices."""
+
+        def visible(rows: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
+            words = self.bits[ids[rows], texels >> np.uint32(5)]
+            return (words >> (texels & np.uint32(31)) & np.uint32(1)).astype(bool)
+
+        return AngularGrid(self.lighting).sample(self.normals[ids], visible).features
+
+
+@dataclass(frozen=True)
+class _Local:
+    """Sparse vertices of the sample, and the dense ones that they are reconstructed from.
+
+    Attributes
+    ----------
+    exact : (n, n_directions) float32
+    sparse, dense : (n,), (n_dense,) int64
+        Vertices of the mesh.
+    rows : (n_dense, n_directions) float32
+    features : (n_dense, words) uint32 bits
+    near : (n, k) int32
+        Rows of ``rows``, -1 where there are fewer.
+    """
+
+    exact: NDArray[np.float32]
+    sparse: NDArray[np.int64]
+    dense: NDArray[np.int64]
+    rows: NDArray[np.float32]
+    features: Bits
+    near: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What a choice led to.
+
+    Attributes
+    ----------
+    squared : (n,) float64
+        Squared L2 norms of the error of the sparse rows of the sample.
+    directions : float
+        Evaluated per sparse vertex, mean.
+    seconds : float
+        Of choosing columns, for the whole mesh.
+    """
+
+    squared: NDArray[np.float64]
+    directions: float
+    seconds: float
+
+
+def compare_choices(
+    scene: Scene,
+    lighting: CubemapLighting,
+    mesh: str,
+    n_vertices: int = 1000,
+    seed: int = 0,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Error of the direct matrix of a mesh for other rows and columns, the fit being the same ([HR10] Figure 5).
+
+    A quarter of the vertices is dense, their rows are exact. All others are reconstructed from dense vertices within
+    the radius of ``huang2010`` by L1 weights, fitted to at most 6% of the directions: columns chosen for each vertex
+    (``features``), or once for a region of about 1000 vertices from the rows of its dense ones. Sampled values are not
+    kept. Beside these, interpolation that evaluates nothing but the dense rows.
+
+    Parameters
+    ----------
+    scene : Scene
+    lighting : CubemapLighting
+    mesh : str
+        Name of the mesh.
+    n_vertices : int
+        Vertices at which the error is measured, drawn from all, dense or not; all if there are fewer.
+    seed : int
+    progress : bool
+        Show a bar.
+
+    Returns
+    -------
+    dict
+        JSON as it is. ``rows``, ``columns``: dense vertices and directions of the budget, ``row_share`` and
+        ``column_share`` the same as shares; ``regions``. By choice: ``error``, the L2 norm of the difference of the
+        rows over that of the exact ones, and its ``standard_error`` (the vertices are a sample); ``directions``, the
+        share that a sparse vertex really used; ``seconds``, of choosing the columns of the whole mesh (those chosen per
+        vertex are extrapolated).
+
+    Raises
+    ------
+    PrtError
+        If there is no such mesh, all of the sample is dense, or none of it is lit.
+    """
+    if n_vertices < 1:
+        raise PrtError(f"n_vertices is {n_vertices}: give 1 or more")
+    surface = _surface(scene, lighting, mesh)
+    n, count = len(surface.positions), max(1, round(COLUMNS * lighting.n_directions))
+    by_rank = choose_dense(
+        surface.positions, surface.keys, lambda ids: surface.bits[ids], ROWS, radius=RADIUS, seed=seed
+    ).ids
+    at_random = weighted_choice(np.ones(n), surface.keys, len(by_rank), seed + 1)
+    sample = weighted_choice(np.ones(n), surface.keys, n_vertices, seed + 2)
+    norms = (surface.rows(sample).astype(np.float64) ** 2).sum(axis=1)
+    if not norms.any():
+        raise PrtError(f"the mesh {mesh!r} sees no light at {len(sample)} vertices: choose another mesh")
+
+    regions = _regions(surface.positions[by_rank], n, seed)
+    results = _from_rank(surface, _local(surface, sample, by_rank), regions, count, seed, progress)
+    results["random_rows"] = _by_vertex(_local(surface, sample, at_random), count, n - len(at_random))
+    errors = {}
+    for name in (*FITTED, *INTERPOLATED):
+        dense = np.isin(sample, at_random if name == "random_rows" else by_rank)
+        errors[name] = _relative(results[name].squared, norms, dense)
+    return {
+        "scene": scene.path,
+        "mesh": mesh,
+        "resolution": lighting.resolution,
+        "vertices": len(sample),
+        "seed": seed,
+        "rows": len(by_rank),
+        "row_share": len(by_rank) / n,
+        "columns": count,
+        "column_share": count / lighting.n_directions,
+        "regions": int(regions.max()) + 1,
+        "error": {name: error for name, (error, _) in errors.items()},
+        "standard_error": {name: spread for name, (_, spread) in errors.items()},
+        "directions": {name: results[name].directions / lighting.n_directions for name in FITTED},
+        "seconds": {name: results[name].seconds for name in FITTED},
+    }
+
+
+def plot_choices(report: dict[str, Any]) -> Figure:
+    """Errors of ``compare_choices`` as bars, standard errors on them, and the share of directions that was used."""
+    figure = Figure(figsize=(8.5, 4), layout="constrained")
+    axes = figure.subplots()
+    labels = FITTED | INTERPOLATED
+    errors = [100 * report["error"][name] for name in labels]
+    colours = ["tab:red", *["tab:blue"] * (len(FITTED) - 1), *["0.6"] * len(INTERPOLATED)]
+    spread = [100 * report["standard_error"][name] for name in labels]
+    bars = axes.barh(list(labels.values()), errors, xerr=spread, color=colours)
+    used = [f"; {100 * report['directions'][name]:.1f}% of directions" for name in FITTED]
+    used += ["; no samples"] * len(INTERPOLATED)
+    axes.bar_label(bars, [f"{e:.2f}%{text}" for e, text in zip(errors, used, strict=True)], padding=3)
+    axes.invert_yaxis()
+    axes.set(xlabel="relative L2 of the direct matrix (%)", xlim=(0, 1.6 * max(errors)))
+    figure.suptitle(
+        f"{report['mesh']}: {100 * report['row_share']:.0f}% of the rows are dense, "
+        f"at most {100 * report['column_share']:.0f}% of the columns are sampled elsewhere"
+    )
+    return figure
+
+
+def _surface(scene: Scene, lighting: CubemapLighting, name: str) -> _Surface:
+    inside, points = mesh_named(scene, name).vertices, vertex_points(scene)
+    direct = DirectTransport(scene.normalised, lighting, points)
+    bits = traced_rows(direct, np.arange(inside.start, inside.stop, dtype=np.uint32))
+    return _Surface(
+        scene.normalised_positions[inside], scene.normals[inside], points.keys[inside], bits, lighting
+    )
+
+
+def _local(surface: _Surface, sample: NDArray[np.int64], dense: NDArray[np.int64]) -> _Local:
+    sparse, p = np.setdiff1d(sample, dense), surface.positions
+    if not len(sparse):
+        raise PrtError(
+            f"all {len(sample)} vertices of the sample are dense: draw more, or take a larger mesh"
+        )
+    found = radius_neighbours(p[sparse], p[dense], np.inf, MOST_NEIGHBOURS)
+    beyond = found.distances > RADIUS
+    beyond[:, :LEAST_NEIGHBOURS] = False
+    near = np.where(beyond, -1, found.ids).astype(np.int32)
+    return _Local(surface.rows(sparse), sparse, dense, surface.rows(dense), surface.features(dense), near)
+
+
+def _regions(dense_positions: NDArray[np.float32], n: int, seed: int) -> NDArray[np.int64]:
+    """Region (n_dense,) of each dense vertex of a mesh of n vertices, numbered without gaps."""
+    count = min(max(1, round(n / REGION)), len(dense_positions))
+    p = dense_positions.astype(np.float64)
+    rng = np.random.default_rng(seed)
+    start = p[rng.choice(len(p), count, replace=False)]
+    with warnings.catch_warnings():  # an empty region is left out
+        warnings.simplefilter("ignore", UserWarning)
+        _, labels = kmeans2(p, start, minit="matrix")
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)
+
+
+def _from_rank(
+    surface: _Surface, local: _Local, regions: NDArray[np.int64], count: int, seed: int, progress: bool
+) -> dict[str, _Result]:
+    """All choices but ``random_rows``, from dense rows chosen by rank."""
+    results = {"features": _by_vertex(local, count, len(surface.positions) - len(local.dense))}
+    for name in tqdm(BY_REGION, desc="columns", disable=not progress):
+        results[name] = _by_region(local, regions, BY_REGION[name], count, seed)
+    return results | _interpolations(surface, local)
+
+
+def _by_vertex(local: _Local, count: int, n_sparse: int) -> _Result:
+    """Columns chosen for each sparse vertex; of such the whole mesh has `n_sparse`."""
+    best_features(local.near[:1], local.rows, local.features, count)  # compiles
+    start = time.perf_counter()
+    directions = best_features(local.near, local.rows, local.features, count)
+    seconds = (time.perf_counter() - start) * n_sparse / len(local.sparse)
+    return _fitted(local, directions, seconds)
+
+
+def _by_region(local: _Local, regions: NDArray[np.int64], choose: Columns, count: int, seed: int) -> _Result:
+    """Columns chosen for each region; a sparse vertex belongs to that of the nearest dense one."""
+    start = time.perf_counter()
+    table = np.full((regions.max() + 1, count), -1, np.int32)
+    for region, columns in enumerate(table):
+        chosen = choose(local.rows[regions == region], count, np.random.default_rng([seed, region]))
+        columns[: len(chosen)] = chosen
+    seconds = time.perf_counter() - start
+    return _fitted(local, table[regions[local.near[:, 0]]], seconds)
+
+
+def _fitted(local: _Local, directions: NDArray[np.int32], seconds: float) -> _Result:
+    """L1 weights of the neighbours from the exact values at directions (n, s), -1 where there are fewer."""
+    known = directions >= 0
+    values = np.where(
+        known, np.take_along_axis(local.exact, np.maximum(directions, 0), axis=1), np.float32(0)
+    )
+    weights = l1_fit(*normal_equations(local.rows, local.near, directions, values), RELATIVE_LAMBDA).weights
+    # no directions, no equations: the neighbours' mean, as in huang2010
+    alone = ~known.any(axis=1)
+    present = local.near[alone] >= 0
+    weights[alone] = present / present.sum(axis=1, keepdims=True)
+    return _Result(_squared(local, local.near, weights), float(known.sum(axis=1).mean()), seconds)
+
+
+def _interpolations(surface: _Surface, local: _Local) -> dict[str, _Result]:
+    """Rows from the dense ones alone."""
+    p, normals = surface.positions, surface.normals
+    places = p[local.sparse], normals[local.sparse], p[local.dense], normals[local.dense]
+    near = surface_neighbours(*places, INTERPOLATED_FROM)
+    nearest = np.zeros(near.ids.shape, np.float32)
+    nearest[:, 0] = near.ids[:, 0] >= 0
+    weights = {
+        "nearest": nearest,
+        "inverse_distance": inverse_distance_weights(near),
+        "linear": linear_weights(near, *places),
+    }
+    return {name: _Result(_squared(local, near.ids, w), 0.0, 0.0) for name, w in weights.items()}
+
+
+def _squared(local: _Local, near: NDArray[np.int32], weights: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Squared L2 norms (n,) of the errors of rows that are weighted sums, weights (n, k), of neighbours (n, k)."""
+    squared = np.empty(len(near))
+    for v, (ids, w) in enumerate(zip(near, weights, strict=True)):
+        error = w[ids >= 0] @ local.rows[ids[ids >= 0]] - local.exact[v]
+        squared[v] = (error**2).sum(dtype=np.float64)
+    return squared
+
+
+def _relative(
+    squared: NDArray[np.float64], norms: NDArray[np.float64], dense: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Relative L2 error of a sample, and its standard error, by the squared errors of rows that are not dense.
+
+    The square of the error is a ratio of means; its variance is that of the numerator less the ratio times the
+    denominator, to first order.
+    """
+    all_squared = np.zeros(len(norms))
+    all_squared[~dense] = squared
+    ratio = all_squared.sum() / norms.sum()
+    deviation = np.sqrt(((all_squared - ratio * norms) ** 2).sum()) / norms.sum()
+    error = float(np.sqrt(ratio))
+    return error, float(deviation / (2 * error)) if error else 0.0
