@@ -1,34 +1,40 @@
-"""Time and error of the sparse methods against brute force and a converged reference ([HR10] Figures 9, 10 and 12)."""
+"""Time and error of the sparse methods against brute force and a converged reference ([HR10] sections 4, 5 and 7)."""
 
 from __future__ import annotations
 
-import time
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from mi_sparse_prt.benchmark.figures import MethodPictures, save_figures
+from mi_sparse_prt.benchmark.lighting import RelitReference
 from mi_sparse_prt.benchmark.machine import describe_machine
+from mi_sparse_prt.benchmark.reference import MAX_DEPTH, SPP, Reference
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import LightTransport, Visibility
-from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
 
-MAX_DEPTH = 5
-SPP = 16
-BRUTE_FORCE_ROWS = 64  # per mesh, path traced whole: the others would take as long
-VERTICES, TEXELS = 300, 48  # per mesh and vertex, of the reference
-REFERENCE_SPP = 2048  # of each of its two halves
-BLOCK = 4096
-RAYS_AND_PATHS = ("dense_rays", "sparse_rays", "dense_paths", "sparse_paths")
+METHODS = ("sparse", "huang2010")
+# Phases as Figure 12 names them; what is not listed is its "system time"
+STAGES = {
+    "dense rays": ("dense_rays", "dense_paths"),
+    "sparse rays": ("sparse_rays", "sparse_paths"),
+    "spatial sampling": ("spatial_sampling",),
+    "rank": ("rank",),
+    "angular sampling": ("angular_sampling", "features"),
+    "solver": ("solver", "low_rank", "consensus", "repair"),
+    "held out": ("held_out",),
+}
+RAYS = ("dense rays", "sparse rays", "held out")  # the held-out error is paths
 
 
 def measure_methods(
-    scene: Scene, lighting: CubemapLighting, methods: list[str], progress: bool = True
+    scene: Scene,
+    lighting: CubemapLighting,
+    methods: list[str],
+    progress: bool = True,
+    figures: Path | None = None,
 ) -> dict[str, Any]:
     """Run methods on a scene, direct light and three interreflections, 16 paths per element.
 
@@ -39,16 +45,27 @@ def measure_methods(
     methods : list of str
         Of ``precompute``, without brute force.
     progress : bool
+    figures : path, optional
+        A folder for a PNG of every figure (see ``figures.method_figures``), made if needed.
 
     Returns
     -------
     dict
-        ``brute_force``: ``direct_seconds`` (whole matrix), ``paths_seconds`` (from ``rows`` random whole rows of each
-        mesh, weighted by its vertices) and their sum. ``reference_noise`` per mesh, relative L2. For each of
-        ``methods``: ``seconds`` per phase, ``ratio`` to brute force, ``overhead`` (all that is no ray or path, as a
-        share of its own time, and in microseconds per sparse vertex), ``elements`` (share of all), ``sampling`` rates
-        per mesh, and relative L2 ``errors`` per mesh: ``total``, ``direct`` and ``indirect``, all relative to the
-        whole matrix of the mesh but the direct one, which is relative to the direct matrix. JSON as it is.
+        JSON as it is. ``brute_force``: ``direct_seconds`` (whole matrix), ``paths_seconds`` (from whole wavefronts of
+        successive rows of each mesh) and its standard error, ``seconds`` (their sum), and the ``errors`` that its 16
+        paths leave. ``reference_noise`` per mesh, relative L2 of the matrix, and ``lighting_noise`` per mesh and
+        environment. For each of ``methods``:
+
+        - ``seconds`` per phase, ``stages`` as in Figure 12; ``ratio`` of its time to that of brute force and
+          ``elements`` (share of all), both with the held-out elements, and in ``without_held_out`` without;
+          ``seconds_per_element``, the cost of an element relative to one of brute force; ``overhead``: all that is no
+          ray or path, as a share of its own time, and in microseconds per sparse vertex.
+        - ``elements_of_parts``, ``rays``, and ``sampling`` rates per mesh as in Figure 9.
+        - ``errors`` per mesh: relative L2 ``total``, ``direct`` and ``indirect``, all relative to the whole matrix of
+          the mesh but the direct one, which is relative to the direct matrix; ``standard_error`` of those that are
+          sampled; the worst of sampled whole ``rows``, and of all ``direct_rows`` and ``direct_columns``.
+        - ``environments`` per mesh: relative L2 of the relit vertices. ``rotation``: the same while an environment
+          turns, and how it changes from frame to frame.
 
     Raises
     ------
@@ -56,11 +73,12 @@ def measure_methods(
         If a method is unknown or brute force itself.
     """
     for method in methods:
-        if method not in ("sparse", "huang2010"):
+        if method not in METHODS:
             raise PrtError(
-                f"method {method!r} cannot be compared with brute force; choose sparse or huang2010"
+                f"method {method!r} cannot be compared with brute force; choose {' or '.join(METHODS)}"
             )
-    reference = _Reference(scene, lighting)
+    reference = Reference(scene, lighting, progress)
+    relit = RelitReference(scene, reference.direct, progress)
     brute_force = reference.time_brute_force()
     report: dict[str, Any] = {
         "machine": describe_machine(),
@@ -69,142 +87,64 @@ def measure_methods(
             "vertices": len(scene.positions),
             "directions": lighting.n_directions,
         },
-        "brute_force": brute_force,
+        "parameters": {"max_depth": MAX_DEPTH, "spp": SPP},
+        "brute_force": brute_force | {"errors": reference.brute_force_errors()},
         "reference_noise": reference.noise(),
+        "lighting_noise": relit.noise(),
         "methods": {},
     }
-    for method in methods:
+    pictures = MethodPictures(scene, reference.direct, progress) if figures else None
+    for method in dict.fromkeys(methods):
         transport = precompute(scene, lighting, method, max_depth=MAX_DEPTH, spp=SPP, progress=progress)
-        report["methods"][method] = _summary(transport, brute_force["seconds"], reference)
+        errors, direct = reference.errors(transport)
+        report["methods"][method] = (
+            _cost(transport, brute_force["seconds"]) | {"errors": errors} | relit.errors(transport)
+        )
+        if pictures:
+            pictures.add(method, transport, direct.vertices())
+    if figures and pictures:
+        save_figures(figures, report, pictures)
     return report
 
 
-def _summary(transport: LightTransport, brute_force: float, reference: _Reference) -> dict[str, Any]:
+def _cost(transport: LightTransport, brute_force: float) -> dict[str, Any]:
+    """Time and elements, the held-out ones included, and where the time went."""
     made = transport.report
-    seconds = made["seconds"]
-    rays = sum(seconds.get(name, 0.0) for name in RAYS_AND_PATHS)
-    own = seconds["total"] - seconds["held_out"]  # validation, which brute force would need as well
-    total = made["elements_total"]
-    sparse = sum(
-        (1 - rates["dense_vertices"]) * (mesh.vertices.stop - mesh.vertices.start)
-        for mesh, rates in zip(transport.meshes, made["sampling"].values(), strict=True)
-    )
+    seconds, total = made["seconds"], made["elements_total"]
+    stages = breakdown(seconds)
+    overhead = seconds["total"] - sum(stages[name] for name in RAYS)
+    evaluated = made["elements_evaluated"]
+    elements = (evaluated + made["estimated_error"]["elements"]) / total
+    ratio = seconds["total"] / brute_force
+    own = seconds["total"] - seconds["held_out"]
     return {
         "seconds": seconds,
-        "ratio": own / brute_force,
-        "overhead": {"share": 1 - rays / own, "microseconds_per_sparse_vertex": 1e6 * (own - rays) / sparse},
-        "elements": made["elements_evaluated"] / total,
+        "stages": stages,
+        "ratio": ratio,
+        "elements": elements,
+        "without_held_out": {"ratio": own / brute_force, "elements": evaluated / total},
+        "seconds_per_element": ratio / elements,
+        "overhead": {
+            "share": overhead / seconds["total"],
+            "microseconds_per_sparse_vertex": 1e6 * overhead / max(_sparse_vertices(transport), 1),
+        },
         "elements_of_parts": {name: count / total for name, count in made["elements"].items()},
         "rays": made["rays"],
         "sampling": made["sampling"],
-        "errors": reference.errors(transport),
         "estimated_error": made["estimated_error"],
         "stored_bytes": transport.nbytes,
     }
 
 
-class _Reference:
-    """The exact direct matrix, and converged indirect light at random elements, in two independent halves."""
+def breakdown(seconds: dict[str, float]) -> dict[str, float]:
+    """Seconds of phases as those of the stages of Figure 12; they add up to ``seconds["total"]``."""
+    stages = {stage: sum(seconds.get(phase, 0.0) for phase in phases) for stage, phases in STAGES.items()}
+    return stages | {"system": seconds["total"] - sum(stages.values())}
 
-    def __init__(self, scene: Scene, lighting: CubemapLighting) -> None:
-        self.scene, self.lighting, self.points = scene, lighting, vertex_points(scene)
-        self.solver = DirectTransport(scene.normalised, lighting, self.points)
-        bits, self.direct_seconds = self._direct()
-        self.direct = Visibility(bits, scene.normals, lighting)
-        rng = np.random.default_rng(1)
-        self.vertices, self.texels = [], []
-        for mesh in scene.meshes:
-            n = mesh.vertices.stop - mesh.vertices.start
-            ids = mesh.vertices.start + np.sort(rng.choice(n, min(n, VERTICES), replace=False))
-            self.vertices.append(ids)
-            self.texels.append(rng.integers(lighting.n_directions, size=(len(ids), TEXELS)))
-        self.halves = [self._indirect(1 << 30), self._indirect((1 << 30) + 1)]
 
-    def _direct(self) -> tuple[NDArray[Any], float]:
-        stored = self.solver.row_storage(len(self.points))
-        self.solver.rows(np.arange(min(16, len(stored)), dtype=np.uint32))  # compiles
-        start = time.perf_counter()
-        for a in range(0, len(stored), self.solver.block_size):
-            ids = np.arange(a, min(a + self.solver.block_size, len(stored)), dtype=np.uint32)
-            stored[a : a + len(ids)] = self.solver.rows(ids)
-        return stored, time.perf_counter() - start
-
-    def _paths(self, spp: int, seed: int) -> PathTransport:
-        channels = 1 if self.scene.grey else 3
-        return PathTransport(
-            self.scene.normalised, self.lighting, self.points, "direction", MAX_DEPTH, spp, channels, seed
-        )
-
-    def _indirect(self, seed: int) -> list[NDArray[np.float64]]:
-        """White indirect light per mesh, (k, t, channels)."""
-        solver, found = self._paths(REFERENCE_SPP, seed), []
-        for ids, texels in zip(self.vertices, self.texels, strict=True):
-            mean = solver.elements(np.repeat(ids, TEXELS), texels.ravel()).mean
-            weights = self.lighting.solid_angles[texels][..., None]
-            found.append(mean.reshape(*texels.shape, -1).astype(np.float64) * weights)
-        return found
-
-    def time_brute_force(self) -> dict[str, Any]:
-        """Seconds that all elements would take."""
-        solver, rng, seconds = self._paths(SPP, 0), np.random.default_rng(2), []
-        for mesh in self.scene.meshes:
-            n = mesh.vertices.stop - mesh.vertices.start
-            count = min(n, BRUTE_FORCE_ROWS)
-            ids = np.sort(mesh.vertices.start + rng.choice(n, count, replace=False)).astype(np.uint32)
-            solver.rows(ids)  # compiles, and warms up
-            start = time.perf_counter()
-            for a in range(0, count, solver.block_size):
-                solver.rows(ids[a : a + solver.block_size])
-            seconds.append(n / count * (time.perf_counter() - start))
-        return {
-            "direct_seconds": self.direct_seconds,
-            "paths_seconds": sum(seconds),
-            "seconds": self.direct_seconds + sum(seconds),
-            "rows": BRUTE_FORCE_ROWS,
-        }
-
-    def noise(self) -> dict[str, float]:
-        """Relative L2 noise of the mean of both halves, per mesh."""
-        noise = {}
-        for k, mesh in enumerate(self.scene.meshes):
-            x, y = self.halves[0][k], self.halves[1][k]
-            noise[mesh.name] = float(np.sqrt(((x - y) ** 2).mean() / 4 / self._square(k)))
-        return noise
-
-    def _exact(self, k: int) -> NDArray[np.float32]:
-        """White direct light at the elements of mesh k, (n, t, 1)."""
-        rows = self.direct.rows(self.vertices[k])
-        return np.take_along_axis(rows, self.texels[k][..., None], axis=1)
-
-    def _square(self, k: int) -> float:
-        """Mean square of the elements of mesh k, free of noise."""
-        exact = self._exact(k)
-        return float(((exact + self.halves[0][k]) * (exact + self.halves[1][k])).mean())
-
-    def errors(self, transport: LightTransport) -> dict[str, dict[str, float]]:
-        """Relative L2 errors per mesh; noise of the reference taken out by its two halves."""
-        found = {}
-        for k, mesh in enumerate(self.scene.meshes):
-            ids, texels = self.vertices[k], self.texels[k][..., None]
-            indirect: NDArray[np.floating] = np.zeros(1)
-            if transport.indirect is not None:
-                indirect = np.take_along_axis(transport.indirect.rows(ids), texels, axis=1)
-            direct = np.take_along_axis(transport.direct.rows(ids), texels, axis=1) - self._exact(k)
-            x, y = (indirect - half[k] for half in self.halves)
-            parts = {"total": (direct + x) * (direct + y), "indirect": x * y}
-            found[mesh.name] = {
-                name: float(np.sqrt(max(square.mean(), 0) / self._square(k)))
-                for name, square in parts.items()
-            }
-            found[mesh.name]["direct"] = self._direct_error(transport, mesh.vertices)
-        return found
-
-    def _direct_error(self, transport: LightTransport, inside: slice) -> float:
-        """Relative L2 of the direct part over all vertices of a mesh."""
-        error = norm = 0.0
-        for a in range(inside.start, inside.stop, BLOCK):
-            ids = np.arange(a, min(a + BLOCK, inside.stop))
-            exact = self.direct.rows(ids)
-            error += float(((transport.direct.rows(ids) - exact) ** 2).sum())
-            norm += float((exact**2).sum())
-        return float(np.sqrt(error / norm)) if norm else 0.0
+def _sparse_vertices(transport: LightTransport) -> float:
+    return sum(
+        (1 - transport.report["sampling"][mesh.name]["dense_vertices"])
+        * (mesh.vertices.stop - mesh.vertices.start)
+        for mesh in transport.meshes
+    )

@@ -418,6 +418,12 @@ def benchmark(
             show_default=False,
         ),
     ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Draw what --method measures: PNG files there.", show_default=False
+        ),
+    ] = None,
     edge_length: EdgeLength = None,
     define: Define = None,
     variant: Variant = None,
@@ -428,19 +434,29 @@ def benchmark(
 
     Example: mi-sparse-prt benchmark scenes_xml/bunny.xml --json benchmark.json
 
+    With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
+
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
     from mi_sparse_prt.benchmark import run_benchmark
     from mi_sparse_prt.benchmark.methods import measure_methods
 
+    if figures is not None and not method:
+        raise typer.BadParameter("there are figures of methods only: give --method", param_hint="--figures")
     with running(json_file, quiet) as command:
+        if figures is not None:
+            check_folder(figures)
         loaded = prt.load_scene(scene, edge_length, **_definitions(define))
         lighting = prt.CubemapLighting(resolution)
         with command.prompt_interrupts():
             if method:
-                command.report = measure_methods(loaded, lighting, [m.value for m in method], not quiet)
+                command.report = measure_methods(
+                    loaded, lighting, [m.value for m in method], not quiet, figures
+                )
             else:
                 command.report = run_benchmark(loaded, lighting, repeats, progress=not quiet)
+        if figures is not None:
+            command.written.append(figures)
         command.show(*(methods_tables if method else benchmark_tables)(command.report))
 
 

@@ -174,32 +174,75 @@ def benchmark_tables(report: dict[str, Any]) -> list[Table]:
 
 
 def methods_tables(report: dict[str, Any]) -> list[Table]:
-    """What ``measure_methods`` found: cost and error of each method, and where its time went."""
+    """What ``measure_methods`` found: cost and errors of brute force and of each method."""
     brute = report["brute_force"]
-    tables = []
-    for method, found in report["methods"].items():
-        table = _table(f"{method} against brute force ({_duration(brute['seconds'])})", "", "")
-        table.add_row("elements evaluated", f"{found['elements']:.2%}")
-        for part, share in found["elements_of_parts"].items():
-            table.add_row(f"  {part}", f"{share:.2%}")
-        table.add_row("time / brute force", f"{found['ratio']:.1%}")
-        overhead = found["overhead"]
+    table = _table(f"Brute force: {_duration(brute['seconds'])}", "", "")
+    table.add_row("direct light, the whole matrix", _duration(brute["direct_seconds"]))
+    deviation = _duration(brute["paths_seconds_standard_error"])
+    table.add_row("paths, from some rows", f"{_duration(brute['paths_seconds'])} +- {deviation}")
+    for mesh, errors in brute["errors"].items():
+        table.add_row(f"relative L2, {mesh}", _share(errors["total"]))
+        table.add_row("  noise of the reference", _share(report["reference_noise"][mesh]))
+    return [table, *(_method_table(method, found) for method, found in report["methods"].items())]
+
+
+def _method_table(method: str, found: dict[str, Any]) -> Table:
+    table = _table(f"{method} against brute force", "", "")
+    without = found["without_held_out"]
+    table.add_row(
+        "elements evaluated", f"{found['elements']:.2%} ({without['elements']:.2%} without held out)"
+    )
+    for part, share in found["elements_of_parts"].items():
+        table.add_row(f"  {part}", f"{share:.2%}")
+    table.add_row("time / brute force", f"{found['ratio']:.1%} ({without['ratio']:.1%} without held out)")
+    table.add_row("cost of an element, brute force = 1", f"{found['seconds_per_element']:.2f}")
+    overhead = found["overhead"]
+    table.add_row(
+        "overhead",
+        f"{overhead['share']:.1%}, {overhead['microseconds_per_sparse_vertex']:.0f} us per sparse vertex",
+    )
+    for mesh, rates in found["sampling"].items():
+        rows = ", ".join(f"{name.replace('_', ' ')} {value:.1%}" for name, value in rates.items())
+        table.add_row(f"sampling, {mesh}", rows)
+    for mesh, errors in found["errors"].items():
+        table.add_section()
+        _add_errors(table, mesh, errors)
+        _add_relit(table, found["environments"][mesh], found["rotation"], mesh)
+    table.add_section()
+    for stage, seconds in found["stages"].items():
+        table.add_row(f"  {stage}", f"{_duration(seconds)}, {seconds / found['seconds']['total']:.1%}")
+    return table
+
+
+def _add_errors(table: Table, mesh: str, errors: dict[str, Any]) -> None:
+    """Relative L2 of the matrix of a mesh, and its worst rows and columns."""
+    for part in ("total", "direct", "indirect"):
+        deviation = errors["standard_error"].get(part)
+        value = f"{errors[part]:.2%}" + ("" if deviation is None else f" +- {deviation:.2%}")
+        table.add_row(f"relative L2, {mesh}, {part}", value)
+    for part, name in (
+        ("rows", "some rows"),
+        ("direct_rows", "rows, direct"),
+        ("direct_columns", "columns, direct"),
+    ):
+        worst = errors[part]
         table.add_row(
-            "overhead",
-            f"{overhead['share']:.1%}, {overhead['microseconds_per_sparse_vertex']:.0f} us per sparse vertex",
+            f"  {name}: 95th percentile, worst", f"{worst['95th_percentile']:.2%}, {worst['max']:.2%}"
         )
-        for mesh, errors in found["errors"].items():
-            parts = ", ".join(f"{part} {value:.2%}" for part, value in errors.items())
-            table.add_row(f"relative L2, {mesh}", parts)
-            noise = report["reference_noise"][mesh]
-            table.add_row("  noise of the reference", f"{noise:.2%}")
-        for mesh, rates in found["sampling"].items():
-            rows = ", ".join(f"{name.replace('_', ' ')} {value:.1%}" for name, value in rates.items())
-            table.add_row(f"sampling, {mesh}", rows)
-        for phase, seconds in found["seconds"].items():
-            table.add_row(f"  {phase}", _duration(seconds))
-        tables.append(table)
-    return tables
+
+
+def _add_relit(table: Table, environments: dict[str, Any], rotation: dict[str, Any], mesh: str) -> None:
+    """Relative L2 of the relit vertices of a mesh."""
+    worst = max(
+        (name for name in environments if name != "mean"), key=lambda n: environments[n]["relative_l2"]
+    )
+    table.add_row("  relit, mean over environments", f"{environments['mean']:.2%}")
+    table.add_row(f"  relit, worst of them: {worst}", f"{environments[worst]['relative_l2']:.2%}")
+    mean = rotation["meshes"][mesh]["mean"]
+    table.add_row(f"  relit, {rotation['environment']} turning", f"{mean['error']:.2%}")
+    table.add_row(
+        "  change per frame: error, light", f"{mean['change_of_error']:.2%}, {mean['change_of_light']:.2%}"
+    )
 
 
 def _kernel_row(kernels: dict[str, Any], blocks: int) -> tuple[str, str]:

@@ -29,6 +29,7 @@ from mi_sparse_prt.transport.path import PathTransport
 
 NEIGHBOURS = 8
 PILOT = 512  # sparse vertices of a mesh that tell whether samples help
+LEAST_NOISE = 0.1  # of a sample, in means of all: a few paths may agree by chance
 BLOCK = 4096  # sparse vertices at a time
 
 
@@ -106,13 +107,17 @@ def _dense_rows(
 
 
 def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add to each row what its sum lacks, in the proportions of the mean row.
+    """Add what the sums of rows and of columns lack, in the proportions of the other columns and rows.
 
-    Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: even light stays unbiased.
+    Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: a mesh gets what it should
+    from every direction, a vertex what it should under even light.
     """
-    mean, lacking = shrunk.mean(axis=0), (rows - shrunk).sum(axis=1)
-    total = float(mean.sum())
-    return shrunk + lacking[:, None] * (mean / total) if total > 0 else shrunk
+    by_column, by_row = shrunk.mean(axis=0), shrunk.mean(axis=1)
+    total = float(by_column.sum()), float(by_row.sum())
+    if min(total) <= 0:
+        return shrunk
+    kept = shrunk + (rows - shrunk).sum(axis=1)[:, None] * (by_column / total[0])
+    return kept + (by_row / total[1])[:, None] * (rows - kept).sum(axis=0)
 
 
 def _prior(scene: Scene, group: Neighbourhood, dense: Dense) -> tuple[Neighbours, NDArray[np.float32]]:
@@ -205,6 +210,7 @@ class _Fit:
             values[:, rows, at] = found.mean.T
             present = near >= 0
             noise = (self._noise[near] * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
+            noise = np.maximum(noise, LEAST_NOISE * self._noise.mean())
             halves = [self._system(directions[:, k::2], values[:, :, k::2], near, prior) for k in (0, 1)]
         return (halves[0], halves[1]), noise
 

@@ -29,6 +29,13 @@ class Neighbourhood:
         """Neighbours (n_sparse, k) of the sparse vertices."""
         return self.near.ids[self.sparse - self.mesh.vertices.start]
 
+    def around_sparse(self, scene: Scene) -> NDArray[np.int32]:
+        """The nearest of all vertices (n_sparse, k) around each sparse vertex, counted from the first of the mesh."""
+        inside = self.mesh.vertices
+        p, n = scene.normalised_positions, scene.normals
+        around = surface_neighbours(p[self.sparse], n[self.sparse], p[inside], n[inside], NEIGHBOURS + 1)
+        return around.ids[:, 1:]  # the first is the vertex itself
+
 
 def neighbourhoods(
     scene: Scene, sampler: DenseSampler, clock: Stopwatch

@@ -10,20 +10,17 @@ and interpolated along the surface: T_indirect = A D.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import Interpolated, Visibility
 from mi_sparse_prt.methods.dense import Dense, DenseSampler
 from mi_sparse_prt.methods.indirect import indirect_part
-from mi_sparse_prt.methods.neighbourhoods import NEIGHBOURS, Neighbourhood, neighbourhoods
+from mi_sparse_prt.methods.neighbourhoods import Neighbourhood, neighbourhoods
 from mi_sparse_prt.methods.parts import Parts
-from mi_sparse_prt.reconstruction.neighbours import surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import BITS, Bits, above_horizon, counts, listed, ones, overwrite, pack
+from mi_sparse_prt.sampling.bits import Bits, above_horizon, counts, listed, overwrite, pack
 from mi_sparse_prt.sampling.features import contested
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -31,9 +28,7 @@ from mi_sparse_prt.transport.path import PathTransport
 
 DENSE = 0.2  # of the vertices of a mesh
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
-HELD_OUT = 16  # random directions per sparse vertex in a round of repair
-TOLERATED = 0.03  # relative L2 of a neighbourhood's direct light that is not repaired
-ROUNDS = 2
+ROUNDS = 2  # of repair
 
 
 def sparse_parts(
@@ -68,9 +63,10 @@ def sparse_parts(
     state = _Visibility(direct, dense, clock)
     for group in groups:
         state.reconstruct(group)
-    for number in range(ROUNDS):
-        for group in groups:
-            state.repair(scene, group, (seed << 4) + number)
+        with clock.phase("repair"):
+            near = group.around_sparse(scene)
+        for _ in range(ROUNDS):
+            state.repair(group, near)
 
     part, paths = None, 0
     if indirect is not None:
@@ -103,72 +99,26 @@ class _Visibility:
             self.visible[group.sparse] = agreed
             self._trace(group.sparse, differ)
 
-    def repair(self, scene: Scene, group: Neighbourhood, seed: int) -> None:
-        """Look at random borrowed elements; where they are wrong too often, trace more.
+    def repair(self, group: Neighbourhood, near: NDArray[np.int32]) -> None:
+        """Trace where the nearest of all vertices differ: they are nearer than the dense ones, and know more by now.
 
-        What is traced are the directions in which the nearest of all vertices differ: they are nearer than the dense
-        ones, and know more by now.
+        Parameters
+        ----------
+        group : Neighbourhood
+        near : (n_sparse, k) int32
+            Vertices of the mesh, counted from its first.
         """
-        if not len(group.sparse):
-            return
+        inside = group.mesh.vertices
         with self._clock.phase("repair"):
-            poor = group.sparse[self._pooled_error(group, seed) > TOLERATED**2]
-            if not len(poor):
-                return
-            inside, p, n = group.mesh.vertices, scene.normalised_positions, scene.normals
-            near = surface_neighbours(p[poor], n[poor], p[inside], n[inside], NEIGHBOURS + 1)
-            # the first neighbour is the vertex itself
-            differ, _ = contested(near.ids[:, 1:], self.visible[inside], self.above[inside], self.above[poor])
-            self._trace(poor, differ & ~self.evaluated[poor])
+            differ, _ = contested(near, self.visible[inside], self.above[inside], self.above[group.sparse])
+            self._trace(group.sparse, differ & ~self.evaluated[group.sparse])
 
-    def _pooled_error(self, group: Neighbourhood, seed: int) -> NDArray[np.float64]:
-        """Squared relative error of rows, (n_sparse,), from held-out elements.
-
-        Those of all vertices that have the same nearest dense vertex are pooled, and these of all dense neighbours.
-        """
-        sparse, near = group.sparse, group.near_sparse
-        texels = _random_texels(self._direct.points.keys[sparse], seed, self._direct.lighting.n_directions)
-        asked, left = _borrowed(self.above, self.evaluated, sparse, texels)
-        tried, wrong = counts(asked), self._trace(sparse, asked)
-        seen = counts(self.visible[sparse])
-
-        def pooled(values: NDArray[np.int64]) -> NDArray[np.float64]:
-            # one more for the padding, -1
-            cells = np.bincount(near[:, 0], weights=values, minlength=len(self._dense.ids) + 1)
-            return np.asarray(cells[near].sum(axis=1))
-
-        rate = pooled(wrong) / np.maximum(pooled(tried), 1)
-        return rate * pooled(left) / np.maximum(pooled(seen), 1)
-
-    def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> NDArray[np.int64]:
-        """Evaluate and keep elements (n, words); returns how many of each vertex were not as borrowed before."""
+    def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> None:
+        """Evaluate and keep elements (n, words)."""
         ids, texels = listed(asked)
         with self._clock.phase("sparse_rays"):
             values = self._direct.visible(vertices[ids], texels)
-        return overwrite(self.visible, self.evaluated, vertices, asked, values)
-
-
-def _random_texels(keys: NDArray[np.uint64], seed: int, n_directions: int) -> NDArray[np.int64]:
-    """Texels (n, HELD_OUT) at random, made of the keys of vertices: the same in whatever order these come."""
-    salt = mix(np.arange(HELD_OUT, dtype=np.uint64) + np.uint64((seed * HELD_OUT) % (1 << 63)))
-    return (mix(mix(keys)[:, None] ^ salt) % np.uint64(n_directions)).astype(np.int64)
-
-
-@numba.njit(parallel=True, cache=True)
-def _borrowed(
-    above: Bits, evaluated: Bits, vertices: NDArray[np.int64], texels: NDArray[np.int64]
-) -> tuple[Bits, NDArray[np.int64]]:
-    """Bits (n, words) of those listed texels (n, k) of some vertices that were borrowed; and how many such all have."""
-    asked = np.zeros((len(vertices), above.shape[1]), np.uint32)
-    left = np.zeros(len(vertices), np.int64)
-    for i in numba.prange(len(vertices)):
-        v = vertices[i]
-        for w in range(above.shape[1]):
-            left[i] += ones(above[v, w] & ~evaluated[v, w])  # type: ignore[call-arg]  # numba gives the context
-        for j in texels[i]:
-            w = j // BITS
-            asked[i, w] |= (np.uint32(1) << np.uint32(j % BITS)) & above[v, w] & ~evaluated[v, w]
-    return asked, left
+        overwrite(self.visible, self.evaluated, vertices, asked, values)
 
 
 def _account(

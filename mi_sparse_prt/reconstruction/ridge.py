@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 DEVIATIONS = (0.005, 0.01, 0.02, 0.04)  # of weights, tried beside 0
 SURE = 3  # standard errors that the saving must be above 0
-LEAST_RIDGE = 1e-9  # of the trace of a Gram matrix
+LEAST_RIDGE = 1e-3  # of the trace of a Gram matrix
 LEAST_GAIN = 0.05  # of the squared error that samples must save, or they are not worth their paths
 
 
@@ -67,7 +67,7 @@ def correction(system: System, noise: Floats, deviation: float) -> Floats:
     """
     k = system.gram.shape[1]
     largest = np.einsum("nii->n", system.gram)
-    # samples without noise decide alone, as far as rounding lets them; dark ones decide nothing
+    # keeps weights bounded where samples have no noise; dark ones decide nothing
     ridge = np.maximum(noise / deviation**2, np.where(largest > 0, LEAST_RIDGE * largest, 1.0))
     damped = system.gram + ridge[:, None, None] * np.eye(k)
     return np.asarray(np.linalg.solve(damped, system.slope[..., None])[..., 0])

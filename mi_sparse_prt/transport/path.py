@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.transport.lanes import PointArrays, TexelArrays, random_generator, start_ray
 
@@ -112,6 +113,11 @@ class PathTransport:
         -------
         Estimate
             ``mean`` (n, channels) in 1/sr, and the variance of that mean.
+
+        Raises
+        ------
+        PrtError
+            If a BSDF gives a value that is not finite, naming the first point and texel whose paths find it.
         """
         mean = np.zeros((len(point_ids), self.channels), dtype=np.float32)
         variance = np.zeros_like(mean)
@@ -137,8 +143,21 @@ class PathTransport:
         )
         mean = np.stack([x.numpy() for x in sums], axis=-1) / self.spp
         second = np.stack([x.numpy() for x in squares], axis=-1) / self.spp
+        self._check_finite(np.isfinite(mean) & np.isfinite(second), points, texels)
         variance = np.maximum(second - mean**2, 0) / max(self.spp - 1, 1)
         return Estimate(mean.astype(np.float32), variance.astype(np.float32))
+
+    def _check_finite(self, finite: NDArray[np.bool_], points: mi.UInt32, texels: mi.UInt32) -> None:
+        """Refuse a block of elements (n, channels) of which one is not finite, naming the first."""
+        bad = np.flatnonzero(~finite.all(axis=1))
+        if not len(bad):
+            return
+        point, texel = int(points.numpy()[bad[0]]), int(texels.numpy()[bad[0]])
+        direction = np.round(self.lighting.directions[texel].astype(float), 4).tolist()
+        raise PrtError(
+            f"vertex {point} gets indirect light that is not finite from texel {texel}, direction {direction} "
+            f"({len(bad)} such elements): repair the BSDF or texture of a surface that it sees"
+        )
 
     def _first_ray(self, point: mi.UInt32, rng: mi.PCG32) -> mi.Ray3f:
         """Cosine-distributed about the shading normal."""
@@ -211,7 +230,7 @@ def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, boun
             mi.Point2f(rng.next_float32(), rng.next_float32()),
             active,
         )
-        lit = active & dr.any(value > 0)
+        lit = active & ~dr.all(value <= 0)  # NaN is lit, so that it is noticed
         lit &= ~scene.ray_test(si.spawn_ray(light.direction), lit)
         result += dr.select(lit, throughput * value * light.irradiance, 0)
 
@@ -220,7 +239,7 @@ def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, boun
         throughput *= weight
         ray = si.spawn_ray(si.to_world(sample.wo))
         mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        active &= dr.any(throughput != 0)
+        active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
         if light.contains is None:
             active &= depth < bounces
         else:  # one more ray after the last mirror, to see the light itself

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from mi_sparse_prt.transport.path import PathTransport
 
 SPP = 64
 STRATA = 4  # shadow rays per axis of a texel
+ROUNDING = 1e-5  # relative errors below are those of float32
 
 
 class HeldOut:
@@ -87,15 +89,16 @@ class HeldOut:
         -------
         dict
             ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes``
-            again, from the spread between vertices), ``elements`` (how many were evaluated).
+            again, from the spread between vertices; where no element is wrong, as if an average one were),
+            ``elements`` (how many were evaluated).
         """
-        # [vertex], means over texels
-        square = ((elements - self._x) * (elements - self._y)).sum(axis=2).mean(axis=1)
-        squares, spreads = self._by_mesh(square)
-        norms, _ = self._by_mesh((self._x * self._y).sum(axis=2).mean(axis=1))
-        meshes = {name: _relative(squares[name], norms[name], spreads[name]) for name in squares}
-        spread = float(np.sqrt(sum(s**2 for s in spreads.values())))
-        total = _relative(sum(squares.values()), sum(norms.values()), spread)
+        squares, norms = self.squared_error(elements), self._squared_norm()
+        strata = {
+            name: _Stratum(squares[inside], norms[inside], self._sizes[name])
+            for name, inside in self._inside.items()
+        }
+        meshes = {name: _relative([stratum]) for name, stratum in strata.items()}
+        total = _relative(list(strata.values()))
         return {
             "total": total[0],
             "meshes": {name: value for name, (value, _) in meshes.items()},
@@ -108,22 +111,29 @@ class HeldOut:
 
     def relative_square(self, values: NDArray[np.floating]) -> float:
         """Sum over the whole matrix of a quantity known at the held-out elements, (k, t), over its squared norm."""
-        sums, _ = self._by_mesh(values.mean(axis=1))
-        norms, _ = self._by_mesh((self._x * self._y).sum(axis=2).mean(axis=1))
-        return sum(sums.values()) / max(sum(norms.values()), 1e-300)
+        sums, norms = (self._total(v) for v in (values, self._squared_norm()))
+        return sums / max(norms, 1e-300)
 
     def squared_error(self, elements: NDArray[np.floating]) -> NDArray[np.float64]:
         """Unbiased squared errors (k, t) of single elements (k, t, 3), summed over channels."""
         return ((elements - self._x) * (elements - self._y)).sum(axis=2)
 
-    def _by_mesh(self, values: NDArray[np.floating]) -> tuple[dict[str, float], dict[str, float]]:
-        """Sums over all vertices of a quantity known at the chosen ones, and their standard errors."""
-        sums, spreads = {}, {}
-        for name, inside in self._inside.items():
-            own, size = values[inside], self._sizes[name]
-            sums[name] = size * float(own.mean())
-            spreads[name] = size * float(own.std(ddof=1)) / np.sqrt(len(own)) if len(own) > 1 else 0.0
-        return sums, spreads
+    def _squared_norm(self) -> NDArray[np.float64]:
+        """Unbiased squared norms (k, t) of single elements, summed over channels."""
+        return (self._x * self._y).sum(axis=2)
+
+    def _total(self, values: NDArray[np.floating]) -> float:
+        """Of a quantity known at the held-out elements, (k, t), the sum over all vertices of its mean over texels."""
+        return sum(self._sizes[name] * float(values[inside].mean()) for name, inside in self._inside.items())
+
+
+@dataclass(frozen=True)
+class _Stratum:
+    """Squared errors and squared norms (k, t) of elements held out in a mesh of ``size`` vertices."""
+
+    squares: NDArray[np.float64]
+    norms: NDArray[np.float64]
+    size: int
 
 
 def _elements(
@@ -147,11 +157,36 @@ def _elements(
     return scene.albedo[vertices][:, None] * white.reshape(*texels.shape, 3)
 
 
-def _relative(square: float, norm: float, spread: float) -> tuple[float, float]:
-    """Relative L2 and its standard error from a squared error (and the spread of that) and a squared norm."""
+def _relative(strata: list[_Stratum]) -> tuple[float, float]:
+    """Relative L2 and its standard error.
+
+    Its square R^2 is a ratio of two sums over meshes; to first order it spreads as e - R^2 n does between vertices, e
+    and n being the squared error and norm of a vertex (Cochran 1977, "Sampling Techniques", 6.11).
+    """
+    norm = sum(s.size * float(s.norms.mean()) for s in strata)
+    square = sum(s.size * float(s.squares.mean()) for s in strata)
     if norm <= 0:  # a black mesh
         return (0.0 if square <= 0 else 1.0), 0.0
-    relative = float(np.sqrt(max(square, 0.0) / norm))  # below zero is noise about zero
+    ratio = max(square, 0.0) / norm  # below zero is noise about zero
+    wrong = ratio > ROUNDING**2
+    variance = sum(s.size**2 * (_variance(s, ratio) if wrong else _one_element(s) ** 2) for s in strata)
+    relative, spread = float(np.sqrt(ratio)), float(np.sqrt(variance)) / norm
     # d sqrt(e) = de / (2 sqrt(e)); near zero the bound is that of sqrt(spread)
-    error = spread / norm / (2 * relative) if square > spread else np.sqrt(spread / norm)
-    return relative, float(error)
+    return relative, spread / (2 * relative) if ratio > spread else float(np.sqrt(spread))
+
+
+def _variance(stratum: _Stratum, ratio: float) -> float:
+    """Variance of the mean of e - R^2 n over vertices.
+
+    A few wrong elements may hold most of the squared error. Those who see few of them see too little spread as well,
+    so the worst vertex is counted once more.
+    """
+    left = (stratum.squares - ratio * stratum.norms).mean(axis=1)  # [vertex]
+    spread = float(left.var(ddof=1)) / len(left) if len(left) > 1 else 0.0
+    return spread + float((left**2).max()) / len(left) ** 2
+
+
+def _one_element(stratum: _Stratum) -> float:
+    """What one average element adds to the mean squared norm: if it alone is wrong, nobody need have seen it."""
+    norms = stratum.norms
+    return float((norms**2).sum() / max(norms.sum(), 1e-300)) / norms.size

@@ -407,6 +407,7 @@ def test_benchmark_needs_repeats(scene):
         ["relight", "x.prt", "-e", "x.exr", "-o", "x.jpg"],
         ["relight", "x.prt", "-e", "x.exr", "--vertices", "x.obj"],
         ["view", "x.prt"],
+        ["benchmark", "x.xml", "--figures", "folder"],
     ],
 )
 def test_usage_errors(arguments):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mi_sparse_prt.methods.sparse import _borrowed, _random_texels
 from mi_sparse_prt.reconstruction.neighbours import linear_weights, surface_neighbours
-from mi_sparse_prt.sampling.bits import unpack
 
 
 def _plane(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -62,23 +60,3 @@ def test_no_neighbours_give_no_weights() -> None:
     assert (near.ids < 0).all()
     weights = linear_weights(near, p, n, p, -n)
     assert np.array_equal(weights, np.zeros((5, 4), np.float32))
-
-
-def test_held_out_texels_belong_to_vertices_not_to_their_order() -> None:
-    keys = np.arange(100, dtype=np.uint64) * np.uint64(0x9E3779B9)
-    order = np.random.default_rng(0).permutation(100)
-    texels = _random_texels(keys, 3, 6144)
-    assert np.array_equal(_random_texels(keys[order], 3, 6144), texels[order])
-    assert (texels != _random_texels(keys, 4, 6144)).mean() > 0.99
-
-
-def test_held_out_texels_are_borrowed_ones() -> None:
-    """Only of those above the horizon that were not evaluated; and how many of these there are."""
-    rng = np.random.default_rng(0)
-    above, evaluated = (rng.integers(0, 1 << 32, (50, 192), dtype=np.uint32) for _ in range(2))
-    vertices, texels = rng.permutation(50)[:30], rng.integers(0, 6144, (30, 16))
-    asked, left = _borrowed(above, evaluated, vertices, texels)
-    free = unpack(above & ~evaluated, 6144)[vertices]
-    assert left.tolist() == free.sum(axis=1).tolist()
-    for row, may, chosen in zip(unpack(asked, 6144), free, texels, strict=True):
-        assert set(np.flatnonzero(row)) == {j for j in chosen if may[j]}

@@ -98,4 +98,4 @@ def test_equal_columns_share_the_correction(noise):
     delta = correction(system(A, prior, y), np.full(N, noise), 0.04)
     assert np.isfinite(delta).all() and np.abs(delta).max() < 0.1
     if noise < 1:
-        assert np.allclose(delta, 0.3 / K, rtol=1e-3)
+        assert np.allclose(delta, 0.3 / K, rtol=1e-2)

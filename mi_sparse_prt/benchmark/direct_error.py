@@ -1,0 +1,100 @@
+"""Errors of the direct part of a matrix against exact visibility: all rows and all columns, nothing is sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.benchmark.estimates import row_errors
+from mi_sparse_prt.matrix import LightTransport, Visibility
+
+BLOCK = 512  # rows at a time: tens of megabytes, and those of their dense vertices
+LIT = (
+    0.1  # of the largest norm: columns below it light next to nothing, and have no relative error to speak of
+)
+
+
+@dataclass(frozen=True)
+class DirectError:
+    """Squared errors and squared norms of white direct transport.
+
+    Attributes
+    ----------
+    rows, row_norms : (n_v,) float64
+    columns, column_norms : dict
+        Mesh name -> (n_directions,) float64, sums over the vertices of the mesh.
+    meshes : dict
+        Mesh name -> slice of its vertices.
+    """
+
+    rows: NDArray[np.float64]
+    row_norms: NDArray[np.float64]
+    columns: dict[str, NDArray[np.float64]]
+    column_norms: dict[str, NDArray[np.float64]]
+    meshes: dict[str, slice]
+
+    def relative_l2(self, mesh: str) -> float:
+        """Over the whole direct matrix of a mesh."""
+        square, norm = (float(a[self.meshes[mesh]].sum()) for a in (self.rows, self.row_norms))
+        return float(np.sqrt(square / norm)) if norm else 0.0
+
+    def mean_square(self, mesh: str) -> float:
+        """Mean squared error of an element of a mesh."""
+        return float(self.rows[self.meshes[mesh]].mean()) / len(self.columns[mesh])
+
+    def vertices(self) -> NDArray[np.float64]:
+        """Relative L2 (n_v,) of every row."""
+        relative = np.empty(len(self.rows))
+        for inside in self.meshes.values():
+            relative[inside] = row_errors(self.rows[inside], self.row_norms[inside])
+        return relative
+
+    def worst_rows(self, mesh: str) -> dict[str, Any]:
+        """95th percentile and maximum of the relative L2 of rows, and its vertex."""
+        inside = self.meshes[mesh]
+        return worst(row_errors(self.rows[inside], self.row_norms[inside]), inside.start, "vertex")
+
+    def worst_columns(self, mesh: str) -> dict[str, Any]:
+        """The same for columns (light from a single texel), of those that light the mesh."""
+        lit = np.flatnonzero(self.column_norms[mesh] >= LIT**2 * self.column_norms[mesh].max())
+        relative = row_errors(self.columns[mesh][lit], self.column_norms[mesh][lit])
+        found = worst(relative, 0, "texel")
+        return found | {"texel": int(lit[found["texel"]])}
+
+
+def worst(relative: NDArray[np.float64], start: int, name: str) -> dict[str, Any]:
+    """95th percentile, maximum, and where that is, counted from ``start``."""
+    return {
+        "95th_percentile": float(np.percentile(relative, 95)),
+        "max": float(relative.max()),
+        name: start + int(relative.argmax()),
+    }
+
+
+def direct_error(exact: Visibility, transport: LightTransport) -> DirectError:
+    """Compare the direct part of a matrix, at all vertices and texels.
+
+    Parameters
+    ----------
+    exact : Visibility
+        All elements by ray tracing.
+    transport : LightTransport
+    """
+    n, n_directions = transport.shape[:2]
+    rows, norms = np.empty(n), np.empty(n)
+    meshes = {mesh.name: mesh.vertices for mesh in transport.meshes}
+    columns = {name: np.zeros(n_directions) for name in meshes}
+    column_norms = {name: np.zeros(n_directions) for name in meshes}
+    for name, inside in meshes.items():
+        for a in range(inside.start, inside.stop, BLOCK):
+            ids = np.arange(a, min(a + BLOCK, inside.stop))
+            truth = exact.rows(ids)[..., 0]
+            square = (transport.direct.rows(ids)[..., 0] - truth) ** 2
+            norm = truth**2
+            rows[ids], norms[ids] = square.sum(axis=1, dtype=np.float64), norm.sum(axis=1, dtype=np.float64)
+            columns[name] += square.sum(axis=0, dtype=np.float64)
+            column_norms[name] += norm.sum(axis=0, dtype=np.float64)
+    return DirectError(rows, norms, columns, column_norms, meshes)

@@ -1,0 +1,74 @@
+"""Relative L2 errors from a part that is known everywhere and another that is known, with noise, at random vertices.
+
+The square of a sum d + r of a known part d (direct light, exact bits) and a path-traced one r is
+``mean(d^2)`` over all vertices plus ``mean((d + x)(d + y) - d^2)`` over the sampled ones, x and y being two independent
+estimates of r: their noise drops out, and the sampling of vertices matters only for what is not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESAMPLINGS = 1000
+FLOOR = 1e-3  # rows in the dark: norms count as at least this share of the mean square of all rows
+
+
+@dataclass(frozen=True)
+class MeanSquare:
+    """Mean square of a quantity over the vertices of a mesh.
+
+    Attributes
+    ----------
+    known : float
+        Mean square of its known part, over all vertices.
+    rest : (k,) float64
+        What the unknown part adds to it at the sampled vertices; without noise only in the mean.
+    """
+
+    known: float
+    rest: NDArray[np.float64]
+
+    @property
+    def value(self) -> float:
+        return self.known + float(self.rest.mean())
+
+
+def mean_square(
+    known: float, at_samples: NDArray[np.floating], x: NDArray[np.floating], y: NDArray[np.floating]
+) -> MeanSquare:
+    """Mean square of d + r.
+
+    Parameters
+    ----------
+    known : float
+        Mean of d^2 over everything.
+    at_samples : (k, ...) float
+        d at the sampled vertices.
+    x, y : (k, ...) float
+        Two independent estimates of r there.
+    """
+    d = at_samples.astype(np.float64)
+    rest = (d + x) * (d + y) - d**2
+    return MeanSquare(known, rest.reshape(len(rest), -1).mean(axis=1))
+
+
+def relative_l2(error: MeanSquare, norm: MeanSquare) -> tuple[float, float]:
+    """sqrt(error / norm) and its standard error, by a bootstrap over the sampled vertices, which both share."""
+    drawn = np.random.default_rng(0).integers(len(error.rest), size=(RESAMPLINGS, len(error.rest)))
+    errors = error.known + error.rest[drawn].mean(axis=1)
+    norms = norm.known + norm.rest[drawn].mean(axis=1)
+    return float(_root(error.value, norm.value)), float(_root(errors, norms).std())
+
+
+def row_errors(squares: NDArray[np.floating], norms: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Relative L2 (n,) of rows from their squared errors and squared norms; rows in the dark count as dim ones."""
+    return _root(squares, np.maximum(norms, FLOOR * norms.mean()))
+
+
+def _root(square: NDArray[np.floating] | float, norm: NDArray[np.floating] | float) -> NDArray[np.float64]:
+    """sqrt(square / norm); 0 for a square below zero (noise about zero), and where both are 0."""
+    square, norm = np.broadcast_arrays(np.maximum(square, 0.0), norm)
+    return np.sqrt(np.divide(square, norm, out=np.where(square > 0, 1.0, 0.0), where=norm > 0))
