@@ -95,6 +95,8 @@ def measure_methods(
     }
     pictures = MethodPictures(scene, reference.direct, progress) if figures else None
     for method in dict.fromkeys(methods):
+        # what is compiled on the first run of an installation is not the method's time
+        precompute(scene, CubemapLighting(WARM_UP), method, max_depth=MAX_DEPTH, spp=1, progress=False)
         transport = precompute(scene, lighting, method, max_depth=MAX_DEPTH, spp=SPP, progress=progress)
         errors, direct = reference.errors(transport)
         report["methods"][method] = (

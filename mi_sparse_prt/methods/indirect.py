@@ -67,18 +67,18 @@ def indirect_part(
     """
     density, noise = _dense_rows(scene, solver, dense, grid, clock, progress)
     fit = _Fit(solver, density, noise, evaluated, grid, clock)
-    rows, columns, values = [], [], []
-    for group in groups:
+    counts, columns, values = [], [], []
+    for group in groups:  # meshes follow each other, and so do rows
         with clock.phase("solver"):
             near, prior = _prior(scene, group, dense)
-        weights = fit.corrected(group, near, prior, progress)
+        corrected = fit.corrected(group, near, prior, progress)
         present = near.ids >= 0
-        inside = group.mesh.vertices
-        rows.append(np.repeat(np.arange(inside.start, inside.stop), present.sum(axis=1)))
-        columns.append(near.ids[present].astype(np.int64))
-        values.append(weights[present].astype(np.float32))
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    weights = scipy.sparse.coo_array(entries, shape=(len(scene.positions), len(dense.ids))).tocsr()
+        counts.append(present.sum(axis=1))
+        columns.append(near.ids[present])
+        values.append(corrected[present])
+    starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+    entries = np.concatenate(values), np.concatenate(columns), starts
+    weights = scipy.sparse.csr_array(entries, shape=(len(scene.positions), len(dense.ids)))
     factor = Indirect(density.astype(np.float16), grid.upsampling, solver.lighting)
     return Interpolated(factor, weights), len(dense.ids) * len(grid.texels) + fit.elements
 
@@ -112,12 +112,14 @@ def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDA
     Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: a mesh gets what it should
     from every direction, a vertex what it should under even light.
     """
-    by_column, by_row = shrunk.mean(axis=0), shrunk.mean(axis=1)
-    total = float(by_column.sum()), float(by_row.sum())
-    if min(total) <= 0:
+    by_column, by_row = shrunk.sum(axis=0), shrunk.sum(axis=1)
+    total = float(by_row.sum())
+    if total <= 0:
         return shrunk
-    kept = shrunk + (rows - shrunk).sum(axis=1)[:, None] * (by_column / total[0])
-    return kept + (by_row / total[1])[:, None] * (rows - kept).sum(axis=0)
+    of_rows, of_columns = rows.sum(axis=1) - by_row, rows.sum(axis=0) - by_column
+    of_columns -= of_rows.sum() / total * by_column  # what the rows get is shared out among columns
+    factors = np.stack([of_rows, by_row], axis=1), np.stack([by_column, of_columns]) / total
+    return np.asarray(shrunk + factors[0] @ factors[1], np.float32)
 
 
 def _prior(scene: Scene, group: Neighbourhood, dense: Dense) -> tuple[Neighbours, NDArray[np.float32]]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
-from sklearn.utils.extmath import randomized_svd
 
-EXACT = 256  # rows or columns, up to which all singular values are computed
-FIRST_RANK = 96  # that is looked for in larger matrices; doubled while it does not suffice
-POWER_ITERATIONS = 3
+SMALL = 256  # rows or columns, up to which no precision is given up for speed
 BALANCINGS = 5  # of rows and columns in turn; the deviations settle within 1%
 LEAST_ROW, LEAST_COLUMN = 0.02, 0.3  # least deviation, in means of all
 
@@ -40,7 +38,9 @@ def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> tuple[
     if not variance.any():  # nothing to take out, or one path per element: the noise is unknown
         return rows, min(rows.shape)
     by_row, by_column = _deviations(variance)
-    left, values, right = _leading(rows / by_row[:, None] / by_column)
+    scaled = np.asarray(rows * (1 / by_row)[:, None], np.float32)
+    scaled *= 1 / by_column
+    left, values, right = _leading(scaled)
     n, m = max(rows.shape), min(rows.shape)
     beta, squares = m / n, values.astype(np.float64) ** 2 / n
     new = np.sqrt(n * np.maximum((squares - beta - 1) ** 2 - 4 * beta, 0) / squares)
@@ -72,15 +72,21 @@ def _leading(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Singular vectors (n, r), values (r,) and vectors (r, m) above the largest value of unit noise alone."""
     least = np.sqrt(scaled.shape[0]) + np.sqrt(scaled.shape[1])
-    rank = FIRST_RANK
-    while True:
-        if min(scaled.shape) <= max(EXACT, 2 * rank):
-            left, values, right = np.linalg.svd(scaled, full_matrices=False)
-        else:
-            left, values, right = randomized_svd(
-                scaled, rank, n_iter=POWER_ITERATIONS, power_iteration_normalizer="QR", random_state=0
-            )
+    if min(scaled.shape) <= SMALL:
+        left, values, right = np.linalg.svd(scaled, full_matrices=False)
         found = int((values > least).sum())
-        if found < len(values) or len(values) == min(scaled.shape):
-            return left[:, :found], values[:found], right[:found]
-        rank *= 2
+        return left[:, :found], values[:found], right[:found]
+    tall = scaled if scaled.shape[0] >= scaled.shape[1] else scaled.T
+    # float32 loses what is 3000 times smaller than the largest; path noise is larger than that
+    gram = scipy.linalg.blas.ssyrk(1.0, tall.T, lower=True)
+    squares, short = scipy.linalg.eigh(
+        gram,
+        lower=True,
+        subset_by_value=(least**2, np.inf),
+        driver="evx",
+        overwrite_a=True,
+        check_finite=False,
+    )
+    values = np.sqrt(squares)
+    long = tall @ (short / values)
+    return (long, values, short.T) if tall is scaled else (short, values, long.T)

@@ -22,6 +22,7 @@ RIDGE = 0.3  # of slopes, in squared steps between dense vertices
 LEAST_COSINE = (
     0.2  # between the normals of neighbours on a surface; below, they see different halves of the scene
 )
+SPACINGS = 4096  # between vertices, of which the median is taken
 WIDEST_SEARCH = 4  # times the wanted count, where normals rule candidates out
 
 
@@ -253,7 +254,8 @@ def _spacing(dense_positions: NDArray[np.float64]) -> float:
     places = np.unique(dense_positions, axis=0)
     if len(places) < 2:
         return 0.0
-    return float(np.median(cKDTree(places).query(places, k=[2], workers=-1)[0]))
+    some = places[:: -(-len(places) // SPACINGS)]
+    return float(np.median(cKDTree(places).query(some, k=[2], workers=-1)[0]))
 
 
 def _check_count(name: str, value: int) -> None:

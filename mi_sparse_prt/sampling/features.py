@@ -30,18 +30,21 @@ def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: 
     differ, agreed : (n, words) uint32 bits
         Directions to sample; and those in which all that know see the sky. Nothing below the horizon.
     """
-    differ, agreed = np.zeros_like(above), np.zeros_like(above)
+    differ, agreed = np.empty_like(above), np.empty_like(above)
+    words = above.shape[1]
     for i in numba.prange(len(above)):
-        for w in range(above.shape[1]):
-            lit, dark = np.uint32(0), np.uint32(0)
-            for k in range(neighbours.shape[1]):
-                row = neighbours[i, k]
-                if row < 0:
-                    break
-                lit |= visible[row, w]
-                dark |= known[row, w] & ~visible[row, w]
-            differ[i, w] = above[i, w] & ((lit & dark) | ~(lit | dark))
-            agreed[i, w] = above[i, w] & lit & ~dark
+        lit, dark = np.zeros(words, np.uint32), np.zeros(words, np.uint32)
+        for k in range(neighbours.shape[1]):
+            row = neighbours[i, k]
+            if row < 0:
+                break
+            seen, knows = visible[row], known[row]
+            for w in range(words):
+                lit[w] |= seen[w]
+                dark[w] |= knows[w] & ~seen[w]
+        for w in range(words):
+            differ[i, w] = above[i, w] & ~(lit[w] ^ dark[w])
+            agreed[i, w] = above[i, w] & lit[w] & ~dark[w]
     return differ, agreed
 
 

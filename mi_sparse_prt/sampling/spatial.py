@@ -106,9 +106,13 @@ def choose_dense(
     seconds = {"rank": 0.0, "choice": 0.0}
     while True:
         start = time.perf_counter()
+        if (
+            len(dense) == 1
+        ):  # matrices are shared: a vertex takes the rank around the nearest of the first ones
+            owner = radius_neighbours(p, p[dense[0]], np.inf, 1).ids[:, 0]
         if len(dense):
-            known = np.concatenate(bits) if bits else np.zeros((0, 1), np.uint32)
-            weights = local_ranks_of_vertices(p, known, p[np.concatenate(dense)], p[dense[0]], radius, k)
+            known, chosen = np.concatenate(bits), np.concatenate(dense)
+            weights = local_ranks_at(p[dense[0]], known, p[chosen], radius, k)[owner].astype(np.float32)
         seconds["rank"] += time.perf_counter() - start
 
         start = time.perf_counter()
@@ -171,32 +175,27 @@ def weighted_choice(
     return np.sort(order[: max(count, 0)])
 
 
-def local_ranks_of_vertices(
-    positions: NDArray[np.floating],
+def local_ranks_at(
+    centres: NDArray[np.floating],
     bits: NDArray[np.uint32],
     dense_positions: NDArray[np.floating],
-    centres: NDArray[np.floating],
     radius: float,
     k: int,
-) -> NDArray[np.float32]:
-    """Local rank at every vertex: that of the up to k nearest dense rows within the radius ([HR10] 4.1).
-
-    Matrices are shared: they are built around a few centres, and a vertex takes the rank of the nearest of them.
+) -> NDArray[np.int64]:
+    """Local rank around some places: that of the up to k nearest dense rows within the radius ([HR10] 4.1).
 
     Parameters
     ----------
-    positions : (n, 3) float, any frame
+    centres : (m, 3) float, any frame
     bits : (n_dense, words) uint32
         Visibility rows of the dense vertices: bit ``j % 32`` of word ``j // 32``.
     dense_positions : (n_dense, 3) float, same frame
-    centres : (m, 3) float, same frame
     radius : float
     k : int
 
     Returns
     -------
-    (n,) float32
-        0 everywhere if there are no dense vertices.
+    (m,) int64
 
     Raises
     ------
@@ -205,11 +204,7 @@ def local_ranks_of_vertices(
     """
     if len(bits) != len(dense_positions):
         raise PrtError(f"{len(dense_positions)} dense vertices have {len(bits)} rows of bits: give one each")
-    if not len(bits):
-        return np.zeros(len(positions), np.float32)
-    ranks = local_rank(bits, radius_neighbours(centres, dense_positions, radius, k).ids)
-    owner = radius_neighbours(positions, centres, np.inf, 1).ids[:, 0]
-    return ranks[owner].astype(np.float32)
+    return local_rank(bits, radius_neighbours(centres, dense_positions, radius, k).ids)
 
 
 def local_rank(bits: NDArray[np.uint32], neighbours_ids: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -135,15 +135,23 @@ def test_sparse_is_better_for_less():
 
 
 def test_indirect_light_of_sparse():
-    """Against brute force at 256 paths: the total within 3%, and per vertex, under even light, within 10%."""
-    ours = result("sparse", 4)
-    assert isinstance(ours.indirect, Interpolated)
-    assert ours.direct.bits.shape == brute_force().direct.bits.shape
+    """Against brute force at 64 paths, under even light, over 4 seeds.
+
+    Expected: per vertex within 20%; the sum within the 2% that 4 x 4 texels per face may miss of it, and three standard
+    errors of these seeds, which are small enough to see 5%.
+    """
     true = precompute(scene(), "brute_force", 4, spp=64).indirect
     even = np.ones((N, 3), np.float32)
-    a, b = ours.indirect.relight(even), true.relight(even)
-    assert a.sum() == pytest.approx(b.sum(), rel=0.03)
-    assert relative(a, b) < 0.2
+    expected, ratios = true.relight(even), []
+    for seed in range(4):
+        ours = precompute(scene(), "sparse", 4, seed=seed)
+        assert isinstance(ours.indirect, Interpolated)
+        found = ours.indirect.relight(even)
+        assert relative(found, expected) < 0.2
+        ratios.append(found.sum() / expected.sum())
+    error = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
+    assert error < 0.02
+    assert abs(np.mean(ratios) - 1) < 0.02 + 3 * error
 
 
 @pytest.mark.parametrize("method", METHODS)
