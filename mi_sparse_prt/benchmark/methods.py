@@ -16,6 +16,7 @@ from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene import Scene
 
 METHODS = ("sparse", "huang2010")
+WARM_UP = 4  # texels per edge of a face
 # Phases as Figure 12 names them; what is not listed is its "system time"
 STAGES = {
     "dense rays": ("dense_rays", "dense_paths"),
