@@ -32,7 +32,8 @@ from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.held_out import HeldOut
 
-_METHODS = {"huang2010": huang2010_parts, "sparse": sparse_parts}
+_DENSE_FRACTIONS = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the vertices, tried in turn for a target error
+_JUDGES = 1 << 20  # seeds of held-out elements that decide
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 _PILOT_SHARE = 8  # a forecast traces this fraction of one wavefront
 
@@ -68,9 +69,10 @@ def precompute(
     spp : int
         Paths per indirect element.
     target_error : float, optional
-        Relative L2 error of the whole matrix to aim at. A pilot on a few vertices then chooses the cheapest
-        ``indirect_resolution`` and ``spp`` (see ``planner``), in place of those given; a warning says if the
-        held-out error shows that the target was missed.
+        Relative L2 error of the whole matrix to aim at. For brute force, a pilot on a few vertices then chooses the
+        cheapest ``indirect_resolution`` and ``spp`` (see ``planner``), in place of those given. ``"sparse"`` starts
+        with 5% of the vertices dense and doubles them until held-out elements meet it; the report counts all that was
+        evaluated on the way. A warning says if the held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices.
     progress : bool
@@ -83,7 +85,7 @@ def precompute(
         Texel basis: shadow rays per element are strata^2.
     checkpoint_folder : path, optional
         Finished rows of the indirect light are kept there until the matrix is complete: the same call after an
-        interruption goes on where it stopped.
+        interruption goes on where it stopped (``"huang2010"``: with the dense rows only).
 
     Returns
     -------
@@ -99,32 +101,22 @@ def precompute(
     settings = Settings(
         lighting.resolution, method, basis, max_depth, spp, target_error, seed, indirect_resolution, strata
     )
-    if checkpoint_folder is not None and method != "brute_force":
-        raise PrtError(f"method {method!r} keeps no checkpoints; leave checkpoint_folder out")
     reset_peak_memory()
     clock, points = Stopwatch(), vertex_points(scene)
     settings, plans = _planned(scene, lighting, settings, clock)
     direct = DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
     indirect, skipped = _indirect_if_any(scene, settings, clock)
+    checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
     if settings.method == "brute_force":
         forecast = _forecast(direct, indirect, clock, progress)
-        checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
         parts = _brute_force(direct, indirect, scene, lighting, clock, progress, checkpoint)
     else:
         forecast = {}
-        parts = _METHODS[settings.method](scene, direct, indirect, seed, clock, progress)
-    transport = LightTransport(
-        lighting=lighting,
-        basis=basis,
-        albedo=scene.albedo,
-        direct=parts.direct,
-        indirect=parts.indirect,
-        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-        vertex_keys=points.keys,
-        scene_hash=scene.hash,
-    )
+        parts = _sparse(direct, indirect, scene, settings, clock, progress, checkpoint)
+    transport = _matrix(scene, points, lighting, basis, parts)
     with clock.phase("held_out"):
         error = _held_out_error(scene, transport, settings)
+    _warn_if_missed(error, settings.target_error)
     transport.report.update(
         {
             **_evaluated(parts, points, lighting, skipped),
@@ -148,11 +140,67 @@ def precompute(
     return transport
 
 
+def _matrix(
+    scene: Scene, points: Points, lighting: CubemapLighting, basis: str, parts: Parts
+) -> LightTransport:
+    """The matrix of evaluated parts, without a report."""
+    return LightTransport(
+        lighting=lighting,
+        basis=basis,
+        albedo=scene.albedo,
+        direct=parts.direct,
+        indirect=parts.indirect,
+        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+        vertex_keys=points.keys,
+        scene_hash=scene.hash,
+    )
+
+
+def _sparse(
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    scene: Scene,
+    settings: Settings,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None,
+) -> Parts:
+    """Evaluate few elements: with a target error, twice as many dense vertices each time until it is met.
+
+    Each attempt is judged by held-out elements of its own; those of the report decide nothing.
+    """
+    if settings.method == "huang2010":
+        return huang2010_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint)
+    if settings.target_error is None:
+        return sparse_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint)
+    attempts: list[Parts] = []
+    for number, fraction in enumerate(_DENSE_FRACTIONS):
+        parts = sparse_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint, fraction)
+        attempts.append(parts)
+        transport = _matrix(scene, direct.points, direct.lighting, settings.basis, parts)
+        with clock.phase("held_out"):
+            judge = replace(settings, seed=settings.seed + _JUDGES + number)
+            error = _held_out_error(scene, transport, judge)["total"]
+        if error <= settings.target_error:
+            break
+    return _with_costs_of(attempts)
+
+
+def _with_costs_of(attempts: list[Parts]) -> Parts:
+    """The last attempt, with what all of them evaluated; repeated elements count again."""
+    return replace(
+        attempts[-1],
+        elements_evaluated=sum(parts.elements_evaluated for parts in attempts),
+        elements={name: sum(parts.elements[name] for parts in attempts) for name in attempts[-1].elements},
+        rays={name: sum(parts.rays[name] for parts in attempts) for name in attempts[-1].rays},
+    )
+
+
 def _planned(
     scene: Scene, lighting: CubemapLighting, settings: Settings, clock: Stopwatch
 ) -> tuple[Settings, list[IndirectPlan]]:
     """Settings with the resolution and samples of the indirect light that a target error needs."""
-    if settings.target_error is None or _no_indirect(scene, settings):
+    if settings.target_error is None or settings.method != "brute_force" or _no_indirect(scene, settings):
         return settings, []
     with clock.phase("plan"):
         plans = plan_indirect(scene, lighting, settings)
@@ -267,18 +315,19 @@ def _checkpoint_path(
 
 
 def _held_out_error(scene: Scene, transport: LightTransport, settings: Settings) -> dict[str, Any]:
-    """The matrix's error from held-out elements; warns if that shows a target error to be missed."""
+    """The matrix's error from held-out elements."""
     indirect = transport.indirect is not None
     held = HeldOut(scene, transport.lighting, transport.basis, settings.max_depth, indirect, settings.seed)
-    error = held.error(np.take_along_axis(transport.rows(held.vertices), held.texels[..., None], axis=1))
-    target = settings.target_error
+    return held.error(np.take_along_axis(transport.rows(held.vertices), held.texels[..., None], axis=1))
+
+
+def _warn_if_missed(error: dict[str, Any], target: float | None) -> None:
     if target is not None and error["total"] - 2 * error["standard_error"]["total"] > target:
         warnings.warn(
             f"the target error {target:g} was not met: the estimate is {error['total']:.3g}",
             PrtWarning,
             stacklevel=3,
         )
-    return error
 
 
 def _forecast(

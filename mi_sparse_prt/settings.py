@@ -42,10 +42,10 @@ class Settings:
                     f"method {self.method!r} chooses the directions of the indirect light itself; "
                     "leave indirect_resolution out"
                 )
-            if self.target_error is not None:
+            if self.target_error is not None and self.method == "huang2010":
                 raise PrtError(
-                    f"method {self.method!r} cannot aim at a target error yet; leave target_error out, "
-                    "and look at the estimated error in the report"
+                    'method "huang2010" has the rates of the paper and aims at no target error; leave it out, '
+                    'or set method="sparse"'
                 )
         if self.basis not in BASES:
             raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")

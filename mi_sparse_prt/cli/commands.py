@@ -15,6 +15,7 @@ from mi_sparse_prt.cli.files import image_bytes, npy_bytes, ply_bytes
 from mi_sparse_prt.cli.running import check_folder, running
 from mi_sparse_prt.cli.tables import (
     benchmark_tables,
+    choices_tables,
     matrix_tables,
     methods_tables,
     relighting_table,
@@ -418,10 +419,19 @@ def benchmark(
             show_default=False,
         ),
     ] = None,
+    choices: Annotated[
+        bool,
+        typer.Option(
+            "--choices",
+            help="Compare choices of rows and columns, and radii of neighbours, on every mesh instead.",
+        ),
+    ] = False,
     figures: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Draw what --method measures: PNG files there.", show_default=False
+            metavar="FOLDER",
+            help="Draw what --method or --choices measures: PNG files there.",
+            show_default=False,
         ),
     ] = None,
     edge_length: EdgeLength = None,
@@ -435,14 +445,18 @@ def benchmark(
     Example: mi-sparse-prt benchmark scenes_xml/bunny.xml --json benchmark.json
 
     With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
+    With --choices --figures FOLDER: its Figures 5 and 6.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
     from mi_sparse_prt.benchmark import run_benchmark
+    from mi_sparse_prt.benchmark.choices import measure_choices
     from mi_sparse_prt.benchmark.methods import measure_methods
 
-    if figures is not None and not method:
-        raise typer.BadParameter("there are figures of methods only: give --method", param_hint="--figures")
+    if figures is not None and not (method or choices):
+        raise typer.BadParameter("there are figures of --method and --choices only", param_hint="--figures")
+    if method and choices:
+        raise typer.BadParameter("one at a time: leave --choices or --method out", param_hint="--choices")
     with running(json_file, quiet) as command:
         if figures is not None:
             check_folder(figures)
@@ -453,11 +467,14 @@ def benchmark(
                 command.report = measure_methods(
                     loaded, lighting, [m.value for m in method], not quiet, figures
                 )
+            elif choices:
+                command.report = measure_choices(loaded, lighting, not quiet, figures)
             else:
                 command.report = run_benchmark(loaded, lighting, repeats, progress=not quiet)
         if figures is not None:
             command.written.append(figures)
-        command.show(*(methods_tables if method else benchmark_tables)(command.report))
+        tables = methods_tables if method else choices_tables if choices else benchmark_tables
+        command.show(*tables(command.report))
 
 
 def _scene_of(

@@ -186,6 +186,35 @@ def methods_tables(report: dict[str, Any]) -> list[Table]:
     return [table, *(_method_table(method, found) for method, found in report["methods"].items())]
 
 
+def choices_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_choices`` found: relative L2 by choice, and by radius."""
+    return [
+        table
+        for mesh, found in report["meshes"].items()
+        for table in (_choices_table(mesh, found["choices"]), _radius_table(mesh, found["radius"]))
+    ]
+
+
+def _choices_table(mesh: str, choices: dict[str, Any]) -> Table:
+    title = f"{mesh}: {choices['row_share']:.0%} of rows, up to {choices['column_share']:.0%} of columns"
+    table = _table(title, "", "relative L2", "directions used")
+    for name, error in choices["error"].items():
+        table.add_row(
+            name.replace("_", " "),
+            f"{error:.2%} +- {choices['standard_error'][name]:.2%}",
+            _share(choices["directions"].get(name, 0.0)),
+        )
+    return table
+
+
+def _radius_table(mesh: str, found: dict[str, Any]) -> Table:
+    table = _table(f"{mesh}: error and radius", "radius", *(f"{radius:g}" for radius in found["radii"]))
+    table.add_row("neighbours", *(f"{count:.0f}" for count in found["neighbours"]))
+    for name, errors in found["error"].items():
+        table.add_row(name.replace("_", " "), *(_share(error) for error in errors))
+    return table
+
+
 def _method_table(method: str, found: dict[str, Any]) -> Table:
     table = _table(f"{method} against brute force", "", "")
     without = found["without_held_out"]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
 from mi_sparse_prt.sampling.bits import Bits
@@ -105,18 +107,27 @@ def indirect_of(
     texels: NDArray[np.integer],
     name: str,
     progress: bool,
-) -> Estimate:
-    """Indirect light of all given vertices at all given texels: mean and variance (k, t, channels)."""
-    shape = (len(vertices), len(texels), solver.channels)
-    mean, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    checkpoint: Path | None = None,
+) -> tuple[Estimate, Checkpoint | None]:
+    """Indirect light of all given vertices at all given texels: mean and variance (k, t, channels).
+
+    And the file in which finished rows are kept, for the caller to remove when all is done.
+    """
+    # [vertex, mean or variance, texel, channel]
+    stored = np.empty((len(vertices), 2, len(texels), solver.channels), np.float32)
+    kept = Checkpoint(checkpoint, stored) if checkpoint else None
+    done = kept.rows_done if kept else 0
     block = max(1, solver.block_elements // max(1, len(texels)))
-    with tqdm(total=len(vertices), desc=name, unit=" rows", disable=not progress) as bar:
-        for a in range(0, len(vertices), block):
+    with tqdm(total=len(vertices), initial=done, desc=name, unit=" rows", disable=not progress) as bar:
+        for a in range(done, len(vertices), block):
             ids = np.asarray(vertices[a : a + block], np.uint32)
             part = solver.elements(
                 np.repeat(ids, len(texels)), np.tile(np.asarray(texels, np.uint32), len(ids))
             )
-            mean[a : a + len(ids)] = part.mean.reshape(len(ids), *shape[1:])
-            variance[a : a + len(ids)] = part.variance.reshape(len(ids), *shape[1:])
+            rows = stored[a : a + len(ids)]
+            for k, values in enumerate((part.mean, part.variance)):
+                rows[:, k] = values.reshape(len(ids), len(texels), solver.channels)
+            if kept:
+                kept.append(rows)
             bar.update(len(ids))
-    return Estimate(mean, variance)
+    return Estimate(stored[:, 0], stored[:, 1]), kept

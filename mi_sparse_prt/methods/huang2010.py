@@ -7,6 +7,8 @@ minimization; T(x) = sum of weights times their rows. Sampled values serve the f
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -41,6 +43,7 @@ def huang2010_parts(
     seed: int,
     clock: Stopwatch,
     progress: bool,
+    checkpoint: Path | None = None,
 ) -> Parts:
     """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``."""
     grid = AngularGrid(direct.lighting)
@@ -52,11 +55,13 @@ def huang2010_parts(
     interreflected = None
     if indirect is not None:
         with clock.phase("dense_paths"):
-            density = indirect_of(indirect, dense.ids, grid.texels, "indirect", progress).mean
-        interreflected = Indirect(density.astype(np.float16), grid.upsampling, direct.lighting)
+            rows, kept = indirect_of(indirect, dense.ids, grid.texels, "indirect", progress, checkpoint)
+        interreflected = Indirect(rows.mean.astype(np.float16), grid.upsampling, direct.lighting)
     weights, evaluated, sparse = _fitted(
         scene, direct, indirect, dense, visibility, interreflected, clock, progress
     )
+    if indirect is not None and kept:
+        kept.remove()
     quarter = np.zeros(direct.lighting.n_directions, bool)
     quarter[grid.texels] = True
     # the paper counts the whole grid, below the horizon too

@@ -7,12 +7,14 @@ them along the surface; where a few samples at sparse vertices show that to be w
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import Indirect, Interpolated
@@ -42,6 +44,7 @@ def indirect_part(
     grid: AngularGrid,
     clock: Stopwatch,
     progress: bool,
+    checkpoint: Path | None = None,
 ) -> tuple[Interpolated, int]:
     """Evaluate and reconstruct indirect light.
 
@@ -59,13 +62,15 @@ def indirect_part(
     clock : Stopwatch
         Phases ``dense_paths``, ``low_rank``, ``sparse_paths``, ``system``, ``solver``.
     progress : bool
+    checkpoint : Path, optional
+        Finished dense rows are kept in files that begin with this name, until all is done.
 
     Returns
     -------
     Interpolated, int
         The part, and how many of its elements were evaluated.
     """
-    density, noise = _dense_rows(scene, solver, dense, grid, clock, progress)
+    density, noise, kept = _dense_rows(scene, solver, dense, grid, clock, progress, checkpoint)
     fit = _Fit(solver, density, noise, evaluated, grid, clock)
     counts, columns, values = [], [], []
     for group in groups:  # meshes follow each other, and so do rows
@@ -79,31 +84,44 @@ def indirect_part(
     starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
     entries = np.concatenate(values), np.concatenate(columns), starts
     weights = scipy.sparse.csr_array(entries, shape=(len(scene.positions), len(dense.ids)))
+    for file in kept:
+        file.remove()
     factor = Indirect(density.astype(np.float16), grid.upsampling, solver.lighting)
     return Interpolated(factor, weights), len(dense.ids) * len(grid.texels) + fit.elements
 
 
 def _dense_rows(
-    scene: Scene, solver: PathTransport, dense: Dense, grid: AngularGrid, clock: Stopwatch, progress: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    scene: Scene,
+    solver: PathTransport,
+    dense: Dense,
+    grid: AngularGrid,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None,
+) -> tuple[NDArray[np.float32], NDArray[np.float64], list[Checkpoint]]:
     """Indirect light (n_dense, n_grid, channels) of the dense vertices on the quarter grid, freed of noise by mesh.
 
-    And the mean variance of an element's estimate in each row, (n_dense,).
+    The mean variance of an element's estimate in each row, (n_dense,); and the files that keep finished rows.
     """
     density = np.empty((len(dense.ids), len(grid.texels), solver.channels), np.float32)
-    noise = np.empty(len(dense.ids))
-    for mesh in scene.meshes:
+    noise, files = np.empty(len(dense.ids)), []
+    for number, mesh in enumerate(scene.meshes):
         chosen = dense.of_mesh(mesh)
         # by key: sums over rows then round alike in whatever order vertices come
         chosen = chosen[np.argsort(solver.points.keys[dense.ids[chosen]], kind="stable")]
+        # other vertices would be dense for another fraction
+        path = checkpoint and checkpoint.with_suffix(f".{number}.{len(dense.ids)}{checkpoint.suffix}")
         with clock.phase("dense_paths"):
-            rows = indirect_of(solver, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress)
+            rows, kept = indirect_of(
+                solver, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress, path
+            )
+        files += [kept] if kept else []
         with clock.phase("low_rank"):
             noise[chosen] = rows.variance.mean(axis=(1, 2))
             for c in range(solver.channels):
                 mean = rows.mean[..., c]
                 density[chosen, :, c] = _with_sums_of(mean, denoised(mean, rows.variance[..., c])[0])
-    return density, noise
+    return density, noise, files
 
 
 def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDArray[np.float32]:

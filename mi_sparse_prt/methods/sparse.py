@@ -10,6 +10,8 @@ and interpolated along the surface: T_indirect = A D.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +40,8 @@ def sparse_parts(
     seed: int,
     clock: Stopwatch,
     progress: bool,
+    checkpoint: Path | None = None,
+    dense_fraction: float | None = None,
 ) -> Parts:
     """Evaluate few elements of T and reconstruct the others.
 
@@ -53,11 +57,15 @@ def sparse_parts(
         Phases as in [HR10] Figure 12: ``dense_rays``, ``sparse_rays``, ``dense_paths``, ``spatial_sampling``,
         ``rank``, ``angular_sampling``, ``neighbours``, ``consensus``, ``repair``, ``solver``.
     progress : bool
+    checkpoint : Path, optional
+        Finished dense rows of the indirect light are kept in files that begin with this name, until all is done.
+    dense_fraction : float, optional
+        Of the vertices of each mesh; a fifth if not given.
     """
     grid = AngularGrid(direct.lighting)
     sampler = DenseSampler(scene, direct, grid, clock)
     for mesh in scene.meshes:
-        sampler.choose(mesh, DENSE, RADIUS, seed)
+        sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed)
     dense, groups = neighbourhoods(scene, sampler, clock)
 
     state = _Visibility(direct, dense, clock)
@@ -70,7 +78,9 @@ def sparse_parts(
 
     part, paths = None, 0
     if indirect is not None:
-        part, paths = indirect_part(scene, indirect, dense, groups, state.evaluated, grid, clock, progress)
+        part, paths = indirect_part(
+            scene, indirect, dense, groups, state.evaluated, grid, clock, progress, checkpoint
+        )
     return _account(scene, direct, indirect, dense, grid, state, part, paths)
 
 

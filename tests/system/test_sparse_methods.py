@@ -2,7 +2,6 @@
 
 import json
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -343,10 +342,57 @@ def test_no_rows_are_asked_for(grey_scene: prt.Scene) -> None:
     assert transport.rows([]).shape == (0, 96, 3)
 
 
-def test_target_errors_and_checkpoints_are_refused_by_name(grey_scene: prt.Scene, tmp_path: Path) -> None:
-    """What a sparse method does not do yet is an error that says so."""
-    lighting = prt.CubemapLighting(4)
+def test_huang2010_has_no_target_error(grey_scene: prt.Scene) -> None:
     with pytest.raises(prt.errors.PrtError, match="target error"):
-        prt.precompute(grey_scene, lighting, method="sparse", target_error=0.1, progress=False)
-    with pytest.raises(prt.errors.PrtError, match="checkpoint"):
-        prt.precompute(grey_scene, lighting, method="sparse", checkpoint_folder=tmp_path, progress=False)
+        prt.precompute(
+            grey_scene, prt.CubemapLighting(4), method="huang2010", target_error=0.1, progress=False
+        )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_interrupted_and_gone_on_with(method, tmp_path, monkeypatch):
+    """Ctrl-C in the middle of the dense rows. The next run traces the others only, and its matrix is the same."""
+    expected = precompute(scene(), method, 3)
+    elements, count = PathTransport.elements, [0]
+    monkeypatch.setattr(PathTransport, "block_elements", 2000)
+
+    def interrupted(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+        count[0] += len(points)
+        if count[0] > 9000:
+            raise KeyboardInterrupt
+        return elements(solver, points, texels, *seed)
+
+    monkeypatch.setattr(PathTransport, "elements", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        precompute(scene(), method, 3, checkpoint_folder=tmp_path)
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) > 4 * 2 * 6000
+
+    traced = [0]
+
+    def counted(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+        traced[0] += len(points)
+        return elements(solver, points, texels, *seed)
+
+    monkeypatch.setattr(PathTransport, "elements", counted)
+    again = precompute(scene(), method, 3, checkpoint_folder=tmp_path)
+    first = traced[0]
+    assert np.array_equal(again.indirect.dense.density, expected.indirect.dense.density)
+    assert not list(tmp_path.iterdir())
+    precompute(scene(), method, 3)
+    assert traced[0] - first >= first + 6000
+
+
+def test_sparse_meets_a_target_error():
+    """Direct light, whose true error is known. A tighter target costs more elements; all attempts are counted.
+
+    Expected: errors near or below their targets (the decision is by held-out elements, which err), and a warning for a
+    target that not even the last attempt can meet.
+    """
+    found = [precompute(scene(), "sparse", target_error=target) for target in (0.1, 0.03)]
+    for target, transport in zip((0.1, 0.03), found, strict=True):
+        assert true_error(transport) < 1.3 * target
+    loose, tight = (transport.report["elements_evaluated"] for transport in found)
+    assert 1.5 * loose < tight
+    assert found[0].report["sampling"]["ground"]["dense_vertices"] < 0.5
+    with pytest.warns(prt.errors.PrtWarning, match="not met"):
+        precompute(scene(), "sparse", target_error=1e-5)

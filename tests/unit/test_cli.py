@@ -392,6 +392,22 @@ def test_benchmark_needs_repeats(scene):
     assert_one_line_error(call("benchmark", scene, "--repeats", 2, "-q"), "at least 3")
 
 
+def test_benchmark_choices(scene, tmp_path):
+    """Figures 5 and 6 of every mesh that is large enough, as tables, JSON and PNG; the others are named."""
+    report = tmp_path / "choices.json"
+    arguments = ("--choices", "--resolution", 4, "--figures", tmp_path / "plots", "--json", report, "-q")
+    result = call("benchmark", scene, *arguments)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(report.read_text())
+    assert len(found["meshes"]) + len(found["skipped"]) == len(prt.load_scene(scene).meshes)
+    assert found["meshes"]
+    for mesh, parts in found["meshes"].items():
+        assert mesh in result.stdout
+        assert all(np.isfinite(error) for error in parts["choices"]["error"].values())
+        for name in ("choices", "radius"):
+            assert (tmp_path / "plots" / f"{name}_{mesh}.png").stat().st_size > 1000
+
+
 # ------------------------------------------------------------------------------------------- usage and Ctrl-C
 
 
@@ -408,6 +424,7 @@ def test_benchmark_needs_repeats(scene):
         ["relight", "x.prt", "-e", "x.exr", "--vertices", "x.obj"],
         ["view", "x.prt"],
         ["benchmark", "x.xml", "--figures", "folder"],
+        ["benchmark", "x.xml", "--choices", "--method", "sparse"],
     ],
 )
 def test_usage_errors(arguments):
