@@ -19,7 +19,7 @@ from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.matrix import LightTransport, Visibility
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense import Dense, DenseSampler
-from mi_sparse_prt.methods.sparse import DENSE, RADIUS
+from mi_sparse_prt.methods.sparse import DENSE, POWER, RADIUS
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene import Scene
@@ -101,7 +101,7 @@ def _dense(scene: Scene, direct: Visibility) -> Dense:
     solver = DirectTransport(scene.normalised, direct.lighting, vertex_points(scene))
     sampler = DenseSampler(scene, solver, AngularGrid(direct.lighting), Stopwatch())
     for mesh in scene.meshes:
-        sampler.choose(mesh, DENSE, RADIUS, 0)
+        sampler.choose(mesh, DENSE, RADIUS, 0, POWER)
     return sampler.dense()
 
 

@@ -23,7 +23,7 @@ SPP = 16
 VERTICES, TEXELS = 5000, 3  # per mesh and vertex, at random: errors differ mostly between vertices
 ELEMENT_SPP = 6144  # of each of the two halves: noise below 0.3% of the matrix
 ROWS, ROW_SPP = 48, 32  # whole rows per mesh; of each half
-TIMED_ROWS, TIMED_BLOCKS = 64, 4  # at least, per mesh, by brute force
+TIMED_ROWS, TIMED_BLOCKS = 64, 16  # at least, per mesh, by brute force
 SEED = 1 << 30  # the methods' seeds are small
 
 Halves = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -64,8 +64,8 @@ class DenseSampler:
         self._ranks = np.zeros(len(scene.positions), np.float32)
         self._iterations: dict[str, list[NDArray[np.int64]]] = {}
 
-    def choose(self, mesh: Mesh, fraction: float, radius: float, seed: int) -> None:
-        """Take a fraction of a mesh's vertices, by local rank within a radius (normalised frame)."""
+    def choose(self, mesh: Mesh, fraction: float, radius: float, seed: int, power: float = 1.0) -> None:
+        """Take a fraction of a mesh's vertices, by local rank within a radius (normalised frame) to a power."""
         inside, start = mesh.vertices, mesh.vertices.start
         samples = choose_dense(
             self.scene.normalised_positions[inside],
@@ -73,6 +73,7 @@ class DenseSampler:
             lambda ids: self.add(ids + start),
             fraction,
             radius=radius,
+            power=power,
             seed=seed,
         )
         self.clock.add("rank", samples.seconds["rank"])

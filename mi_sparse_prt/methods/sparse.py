@@ -5,7 +5,7 @@ ray is traced and its value kept. So the direct part is exact in cosine and soli
 that is stored: with 260 sampled values a vertex, weights and residual of T = A D + S would take more memory.
 
 Indirect light is smooth. Dense rows are path traced on a quarter of the directions, freed of noise by their low rank,
-and interpolated along the surface: T_indirect = A D.
+and interpolated along the surface: T_indirect = A D. See ``methods.indirect``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
-DENSE = 0.2  # of the vertices of a mesh
+DENSE = 0.22  # of the vertices of a mesh
+POWER = 2  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
 
@@ -60,12 +61,12 @@ def sparse_parts(
     checkpoint : Path, optional
         Finished dense rows of the indirect light are kept in files that begin with this name, until all is done.
     dense_fraction : float, optional
-        Of the vertices of each mesh; a fifth if not given.
+        Of the vertices of each mesh; about a fifth if not given.
     """
     grid = AngularGrid(direct.lighting)
     sampler = DenseSampler(scene, direct, grid, clock)
     for mesh in scene.meshes:
-        sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed)
+        sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed, POWER)
     dense, groups = neighbourhoods(scene, sampler, clock)
 
     state = _Visibility(direct, dense, clock)
@@ -127,7 +128,7 @@ class _Visibility:
         """Evaluate and keep elements (n, words)."""
         ids, texels = listed(asked)
         with self._clock.phase("sparse_rays"):
-            values = self._direct.visible(vertices[ids], texels)
+            values = self._direct.visible(vertices.astype(np.uint32)[ids], texels)
         overwrite(self.visible, self.evaluated, vertices, asked, values)
 
 

@@ -51,13 +51,14 @@ def choose_dense(
     step: float = 0.05,
     radius: float | None = None,
     k: int = 30,
+    power: float = 1.0,
     seed: int = 0,
     stop: Callable[[SpatialSamples], bool] | None = None,
 ) -> SpatialSamples:
     """Choose the dense vertices of one mesh in iterations, by the local rank of what is known so far ([HR10] 4.1).
 
     The first iteration takes `step` of the vertices at random; they are the centres of local matrices. Each later one
-    computes the ranks of these and draws `step` more with the ranks as weights, until there are `fraction` of them.
+    computes the ranks of these and draws `step` more by rank, until there are `fraction` of them.
 
     Parameters
     ----------
@@ -75,6 +76,8 @@ def choose_dense(
         Of a local matrix; a tenth of the longest side of the mesh's box if not given.
     k : int
         Rows of a local matrix, at most.
+    power : float
+        Vertices are drawn in proportion to their ranks to this power.
     seed : int
     stop : callable, optional
         Asked after each iteration with what was chosen so far; True ends the choice early.
@@ -99,26 +102,25 @@ def choose_dense(
     if radius is None:
         radius = RADIUS * float(np.ptp(p, axis=0).max()) if n else 0.0
     total = _share(fraction, n)
-    weights = np.ones(n, np.float32)
+    ranks = np.zeros(n, np.float32)
     free = np.ones(n, dtype=bool)
     dense: list[NDArray[np.int64]] = []  # [iteration][vertex], in the order of keys
     bits: list[NDArray[np.uint32]] = []  # [iteration][vertex, word]
     seconds = {"rank": 0.0, "choice": 0.0}
     while True:
         start = time.perf_counter()
-        if (
-            len(dense) == 1
-        ):  # matrices are shared: a vertex takes the rank around the nearest of the first ones
+        if len(dense) == 1:  # shared matrices: a vertex takes the rank around the nearest of the first ones
             owner = radius_neighbours(p, p[dense[0]], np.inf, 1).ids[:, 0]
         if len(dense):
             known, chosen = np.concatenate(bits), np.concatenate(dense)
-            weights = local_ranks_at(p[dense[0]], known, p[chosen], radius, k)[owner].astype(np.float32)
+            ranks = local_ranks_at(p[dense[0]], known, p[chosen], radius, k)[owner].astype(np.float32)
         seconds["rank"] += time.perf_counter() - start
 
         start = time.perf_counter()
         left = np.flatnonzero(free)
         wanted = min(_share(step, n), total - (n - len(left)))
-        new = left[weighted_choice(weights[left], names[left], wanted, _nth_seed(seed, len(dense)))]
+        weights = ranks[left] ** power if len(dense) else np.ones(len(left), np.float32)
+        new = left[weighted_choice(weights, names[left], wanted, _nth_seed(seed, len(dense)))]
         free[new] = False
         dense.append(new)
         seconds["choice"] += time.perf_counter() - start
@@ -126,11 +128,10 @@ def choose_dense(
         if len(new):
             bits.append(visibility(by_key[new]))
 
-        ranks = np.zeros(n, np.float32)
-        if len(dense) > 1:
-            ranks[by_key] = weights
+        by_vertex = np.empty(n, np.float32)
+        by_vertex[by_key] = ranks
         iterations = [np.sort(by_key[ids]) for ids in dense]
-        samples = SpatialSamples(np.sort(by_key[~free]), ranks, iterations, dict(seconds))
+        samples = SpatialSamples(np.sort(by_key[~free]), by_vertex, iterations, dict(seconds))
         if len(samples.ids) >= total or (stop is not None and stop(samples)):
             return samples
 

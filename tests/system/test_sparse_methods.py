@@ -136,18 +136,18 @@ def test_sparse_is_better_for_less():
 def test_indirect_light_of_sparse():
     """Against brute force at 64 paths, under even light, over 4 seeds.
 
-    Expected: per vertex within 20%; the sum within the 2% that 4 x 4 texels per face may miss of it, and three standard
-    errors of these seeds, which are small enough to see 5%.
+    Expected: the mean per vertex within 15%, which is what interpolation costs; the sum within the 2% that 4 x 4 texels
+    per face may miss of it, and three standard errors of these seeds, which are small enough to see 5%.
     """
     true = precompute(scene(), "brute_force", 4, spp=64).indirect
     even = np.ones((N, 3), np.float32)
-    expected, ratios = true.relight(even), []
+    expected, found = true.relight(even), []
     for seed in range(4):
         ours = precompute(scene(), "sparse", 4, seed=seed)
         assert isinstance(ours.indirect, Interpolated)
-        found = ours.indirect.relight(even)
-        assert relative(found, expected) < 0.2
-        ratios.append(found.sum() / expected.sum())
+        found.append(ours.indirect.relight(even))
+    assert relative(np.mean(found, axis=0), expected) < 0.15
+    ratios = [light.sum() / expected.sum() for light in found]
     error = np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     assert error < 0.02
     assert abs(np.mean(ratios) - 1) < 0.02 + 3 * error
@@ -383,13 +383,14 @@ def test_interrupted_and_gone_on_with(method, tmp_path, monkeypatch):
 
 
 def test_sparse_meets_a_target_error():
-    """Direct light, whose true error is known. A tighter target costs more elements; all attempts are counted.
+    """Direct light, whose true error is known. A tighter target costs more attempts, and all of them are counted.
 
     Expected: errors near or below their targets (the decision is by held-out elements, which err), and a warning for a
     target that not even the last attempt can meet.
     """
-    found = [precompute(scene(), "sparse", target_error=target) for target in (0.1, 0.03)]
-    for target, transport in zip((0.1, 0.03), found, strict=True):
+    targets = (0.05, 0.025)
+    found = [precompute(scene(), "sparse", target_error=target) for target in targets]
+    for target, transport in zip(targets, found, strict=True):
         assert true_error(transport) < 1.3 * target
     loose, tight = (transport.report["elements_evaluated"] for transport in found)
     assert 1.5 * loose < tight
