@@ -22,7 +22,7 @@ from mi_sparse_prt.matrix import Indirect, Interpolated
 from mi_sparse_prt.methods.dense import Dense, indirect_of
 from mi_sparse_prt.methods.neighbourhoods import Neighbourhood
 from mi_sparse_prt.reconstruction.low_rank import denoised
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
 from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
@@ -31,6 +31,7 @@ from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.path import PathTransport
 
 NEIGHBOURS = 10
+SMOOTHING = 16  # neighbours by which dense rows are smoothed
 PILOT = 512  # sparse vertices of a mesh that tell whether samples help
 LEAST_NOISE = 0.1  # of a sample, in means of all: a few paths may agree by chance
 BLOCK = 4096  # sparse vertices at a time
@@ -120,10 +121,31 @@ def _dense_rows(
         files += [kept] if kept else []
         with clock.phase("low_rank"):
             noise[chosen] = rows.variance.mean(axis=(1, 2))
+            smoothing = _smoothing(scene, dense.ids[chosen])
             for c in range(solver.channels):
-                mean = rows.mean[..., c]
-                density[chosen, :, c] = _with_sums_of(mean, denoised(mean, rows.variance[..., c])[0])
+                mean, variance = rows.mean[..., c], rows.variance[..., c]
+                density[chosen, :, c] = _with_sums_of(mean, _freed_of_noise(mean, variance, smoothing))
     return density, noise, files
+
+
+def _smoothing(scene: Scene, ids: NDArray[np.int64]) -> scipy.sparse.csr_array:
+    """Weights (n, n) by which rows of some vertices of a mesh are smoothed along the surface."""
+    p, n = scene.normalised_positions[ids], scene.normals[ids]
+    near = surface_neighbours(p, n, p, n, SMOOTHING)
+    weights, present = linear_weights(near, p, n, p, n), near.ids >= 0
+    starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    return scipy.sparse.csr_array((weights[present], near.ids[present], starts), shape=(len(ids), len(ids)))
+
+
+def _freed_of_noise(
+    rows: NDArray[np.float32], variance: NDArray[np.float32], smoothing: scipy.sparse.csr_array
+) -> NDArray[np.float32]:
+    """Low rank first, smoothed along the surface; then what of the rest rises above the noise.
+
+    A single step keeps less of what is local, and more noise where rows hardly change.
+    """
+    smooth = smoothing @ denoised(rows, variance)[0]
+    return np.asarray(smooth + denoised(rows - smooth, variance)[0], np.float32)
 
 
 def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDArray[np.float32]:

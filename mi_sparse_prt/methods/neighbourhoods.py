@@ -12,7 +12,8 @@ from mi_sparse_prt.methods.dense import Dense, DenseSampler
 from mi_sparse_prt.reconstruction.neighbours import Neighbours, surface_neighbours
 from mi_sparse_prt.scene import Mesh, Scene
 
-NEIGHBOURS = 12
+NEIGHBOURS = 12  # dense ones
+AROUND = 20  # of all vertices
 LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
 
 
@@ -33,7 +34,7 @@ class Neighbourhood:
         """The nearest of all vertices (n_sparse, k) around each sparse vertex, counted from the first of the mesh."""
         inside = self.mesh.vertices
         p, n = scene.normalised_positions, scene.normals
-        around = surface_neighbours(p[self.sparse], n[self.sparse], p[inside], n[inside], NEIGHBOURS + 1)
+        around = surface_neighbours(p[self.sparse], n[self.sparse], p[inside], n[inside], AROUND + 1)
         return around.ids[:, 1:]  # the first is the vertex itself
 
 

@@ -29,7 +29,7 @@ from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
 DENSE = 0.22  # of the vertices of a mesh
-POWER = 2  # of the rank, by which they are drawn: errors of indirect light gather where things meet
+POWER = 1.5  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
 
