@@ -61,6 +61,8 @@ def test_ctrl_c_leaves_nothing(tmp_path, phase):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        # a shell that runs the tests in the background has SIGINT ignored, and programs inherit that
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         # The scene has a warning, which comes when it is loaded: from there on, the forecast traces.

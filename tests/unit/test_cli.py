@@ -395,7 +395,7 @@ def test_benchmark_needs_repeats(scene):
 def test_benchmark_choices(scene, tmp_path):
     """Figures 5 and 6 of every mesh that is large enough, as tables, JSON and PNG; the others are named."""
     report = tmp_path / "choices.json"
-    arguments = ("--choices", "--resolution", 4, "--figures", tmp_path / "plots", "--json", report, "-q")
+    arguments = ("--choices", "--resolution", 4, "--figures", tmp_path / "plots", "--json", report)
     result = call("benchmark", scene, *arguments)
     assert result.exit_code == 0, result.stderr
     found = json.loads(report.read_text())

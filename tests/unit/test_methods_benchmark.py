@@ -257,6 +257,7 @@ def test_brute_force_is_timed_on_successive_rows(quick, monkeypatch):
     measured.scene, measured.lighting, measured.points = scene, light, vertex_points(scene)
     measured.direct_seconds = 1.0
     traced = []
+    monkeypatch.setattr("mi_sparse_prt.benchmark.reference.TIMED_BLOCKS", 4)
     monkeypatch.setattr(PathTransport, "block_size", 32)
     monkeypatch.setattr(PathTransport, "rows", lambda solver, ids: traced.append(np.asarray(ids)))
     report = measured.time_brute_force()
