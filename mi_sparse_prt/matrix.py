@@ -206,7 +206,8 @@ class Interpolated:
     dense : Visibility or Indirect
         D, the rows of the densely sampled vertices.
     weights : (n_v, n_dense) sparse float32
-        A: a row has the weights of a vertex's dense neighbours; that of a dense vertex is 1 at itself.
+        A: a row has the weights of a vertex's dense neighbours. That of a dense vertex is 1 at itself (``huang2010``)
+        or smooths its row by its neighbours' (``sparse``).
     """
 
     dense: Visibility | Indirect

@@ -55,8 +55,9 @@ def sparse_parts(
         At the same vertices and the full resolution of the lighting.
     seed : int
     clock : Stopwatch
-        Phases as in [HR10] Figure 12: ``dense_rays``, ``sparse_rays``, ``dense_paths``, ``spatial_sampling``,
-        ``rank``, ``angular_sampling``, ``neighbours``, ``consensus``, ``repair``, ``solver``.
+        Phases as in [HR10] Figure 12: ``dense_rays``, ``sparse_rays``, ``dense_paths``, ``sparse_paths``,
+        ``spatial_sampling``, ``rank``, ``angular_sampling``, ``neighbours``, ``consensus``, ``repair``, ``low_rank``,
+        ``system``, ``solver``.
     progress : bool
     checkpoint : Path, optional
         Finished dense rows of the indirect light are kept in files that begin with this name, until all is done.
