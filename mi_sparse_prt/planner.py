@@ -16,7 +16,7 @@ from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.held_out import HeldOut
+from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 PILOT_VERTICES = 64  # per mesh
 PILOT_SPP = 16
@@ -94,7 +94,7 @@ def plan_indirect(scene: Scene, lighting: CubemapLighting, settings: Settings) -
     """
     assert settings.target_error is not None
     target = settings.target_error
-    held = HeldOut(
+    held = PilotElements(
         scene, lighting, settings.basis, settings.max_depth, True, settings.seed + (1 << 20), PILOT_VERTICES
     )
     plans = []
@@ -110,7 +110,7 @@ def plan_indirect(scene: Scene, lighting: CubemapLighting, settings: Settings) -
 
 
 def _bias_and_noise(
-    scene: Scene, lighting: CubemapLighting, settings: Settings, held: HeldOut
+    scene: Scene, lighting: CubemapLighting, settings: Settings, held: PilotElements
 ) -> tuple[float, float]:
     """Relative L2 of what samples do not remove, and of the noise of one sample per element."""
     points, shape, basis = vertex_points(scene), held.texels.shape, settings.basis
@@ -131,7 +131,9 @@ def _bias_and_noise(
     ), at_one_sample
 
 
-def _at_elements(solver: PathTransport, held: HeldOut) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _at_elements(
+    solver: PathTransport, held: PilotElements
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and variance (k, t, channels) of the held-out elements themselves."""
     estimate = solver.elements(np.repeat(held.vertices, held.texels.shape[1]), held.texels.ravel())
     shape = (*held.texels.shape, solver.channels)
@@ -139,7 +141,7 @@ def _at_elements(solver: PathTransport, held: HeldOut) -> tuple[NDArray[np.float
 
 
 def _interpolated(
-    solver: PathTransport, lighting: CubemapLighting, held: HeldOut
+    solver: PathTransport, lighting: CubemapLighting, held: PilotElements
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and variance (k, t, channels) at the held-out elements, interpolated from coarse rows."""
     estimate, weights = solver.rows(held.vertices), upsampling(solver.lighting, lighting)

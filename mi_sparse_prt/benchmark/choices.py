@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_sparse_prt.benchmark.comparators import compare_choices, plot_choices
-from mi_sparse_prt.benchmark.machine import describe_machine
+from mi_sparse_prt.benchmark.machine import report_header
 from mi_sparse_prt.benchmark.radius import error_against_radius, plot_error_against_radius
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
@@ -39,12 +39,7 @@ def measure_choices(
     """
     directions = max(1, round(DIRECTIONS * lighting.n_directions))
     report: dict[str, Any] = {
-        "machine": describe_machine(),
-        "scene": {
-            "path": scene.path,
-            "vertices": len(scene.positions),
-            "directions": lighting.n_directions,
-        },
+        **report_header(scene, lighting),
         "meshes": {},
         "skipped": [],
     }

@@ -1,4 +1,4 @@
-"""What a timing depends on besides the code: processor, memory, versions."""
+"""What a timing depends on besides the code: processor, memory, versions, and the size of the problem."""
 
 from __future__ import annotations
 
@@ -11,6 +11,22 @@ import drjit as dr
 import psutil
 
 from mi_sparse_prt.cost import versions
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.scene import Scene
+
+
+def report_header(scene: Scene, lighting: CubemapLighting) -> dict[str, Any]:
+    """With what every report of a benchmark begins: ``machine`` and ``scene``."""
+    return {
+        "machine": describe_machine(),
+        "scene": {
+            "path": scene.path,
+            "hash": scene.hash,
+            "vertices": len(scene.positions),
+            "triangles": sum(len(mesh.triangles) for mesh in scene.meshes),
+            "directions": lighting.n_directions,
+        },
+    }
 
 
 def describe_machine() -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from mi_sparse_prt.benchmark.figures import MethodPictures, save_figures
 from mi_sparse_prt.benchmark.lighting import RelitReference
-from mi_sparse_prt.benchmark.machine import describe_machine
+from mi_sparse_prt.benchmark.machine import report_header
 from mi_sparse_prt.benchmark.reference import MAX_DEPTH, SPP, Reference
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
@@ -19,7 +19,7 @@ METHODS = ("sparse", "huang2010")
 WARM_UP = 4  # texels per edge of a face
 # Phases as Figure 12 names them; what is not listed is its "system time"
 STAGES = {
-    "dense rays": ("dense_rays", "dense_paths"),
+    "dense rays": ("pilot", "dense_rays", "dense_paths"),  # the pilot asks rays whether surfaces meet
     "sparse rays": ("sparse_rays", "sparse_paths"),
     "spatial sampling": ("spatial_sampling",),
     "rank": ("rank",),
@@ -82,12 +82,7 @@ def measure_methods(
     relit = RelitReference(scene, reference.direct, progress)
     brute_force = reference.time_brute_force()
     report: dict[str, Any] = {
-        "machine": describe_machine(),
-        "scene": {
-            "path": scene.path,
-            "vertices": len(scene.positions),
-            "directions": lighting.n_directions,
-        },
+        **report_header(scene, lighting),
         "parameters": {"max_depth": MAX_DEPTH, "spp": SPP},
         "brute_force": brute_force | {"errors": reference.brute_force_errors()},
         "reference_noise": reference.noise(),

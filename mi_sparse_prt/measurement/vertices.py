@@ -80,7 +80,7 @@ def _centres_beside_border(
     owners = triangles.ravel()
     chosen = np.flatnonzero(_border_vertices(triangles)[owners])
     owners, face = owners[chosen], chosen // 3
-    width = _widths(positions[triangles])[face]
+    width = _widths(positions[triangles[face]])
     widest = np.zeros(len(positions))
     np.maximum.at(widest, owners, width)
     wide = width >= 0.999 * widest[owners]  # equal but for rounding

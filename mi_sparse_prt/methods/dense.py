@@ -64,27 +64,32 @@ class DenseSampler:
         self._ranks = np.zeros(len(scene.positions), np.float32)
         self._iterations: dict[str, list[NDArray[np.int64]]] = {}
 
-    def choose(self, mesh: Mesh, fraction: float, radius: float, seed: int, power: float = 1.0) -> None:
-        """Take a fraction of a mesh's vertices, by local rank within a radius (normalised frame) to a power."""
+    def choose(
+        self, mesh: Mesh, fraction: float, radius: float, seed: int, power: float = 1.0, step: float = 0.05
+    ) -> None:
+        """Take a fraction of a mesh's vertices in steps, by local rank within a radius (normalised) to a power."""
         inside, start = mesh.vertices, mesh.vertices.start
-        samples = choose_dense(
-            self.scene.normalised_positions[inside],
-            self.direct.points.keys[inside],
-            lambda ids: self.add(ids + start),
-            fraction,
-            radius=radius,
-            power=power,
-            seed=seed,
-        )
-        self.clock.add("rank", samples.seconds["rank"])
-        self.clock.add("spatial_sampling", samples.seconds["choice"])
+        with self.clock.phase("rank"):
+            samples = choose_dense(
+                self.scene.normalised_positions[inside],
+                self.direct.points.keys[inside],
+                lambda ids: self.add(ids + start),
+                fraction,
+                step,
+                radius,
+                power=power,
+                seed=seed,
+            )
+        for phase, sign in (("spatial_sampling", 1), ("rank", -1)):
+            self.clock.add(phase, sign * samples.seconds["choice"])
         self._ranks[inside] = samples.ranks
         self._iterations[mesh.name] = [ids + start for ids in samples.iterations]
 
     def add(self, ids: NDArray[np.int64]) -> Bits:
         """Sample the rows of more vertices; returns their visibility."""
         with self.clock.phase("angular_sampling"):
-            rows = self.grid.sample(self.scene.normals[ids], lambda r, t: self._traced(ids[r], t))
+            names = ids.astype(np.uint32)
+            rows = self.grid.sample(self.scene.normals[ids], lambda r, t: self._traced(names[r], t))
         self._ids.append(ids)
         self._rows.append(rows)
         return rows.visible
@@ -97,7 +102,7 @@ class DenseSampler:
         ]
         return Dense(np.concatenate(self._ids), DenseRows(*joined), self._ranks, self._iterations)
 
-    def _traced(self, ids: NDArray[np.int64], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    def _traced(self, ids: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
         with self.clock.phase("dense_rays"):
             return self.direct.visible(ids, texels)
 

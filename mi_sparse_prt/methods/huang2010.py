@@ -10,11 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import psutil
 import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import Indirect, Interpolated, Visibility
 from mi_sparse_prt.methods.dense import Dense, DenseSampler, indirect_of
 from mi_sparse_prt.methods.parts import Parts
@@ -34,6 +37,7 @@ LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 10, 40  # section 5.1; the nearest ones wher
 DIRECTIONS = 350  # Figure 8
 RELATIVE_LAMBDA = 1e-2
 BLOCK = 4096  # sparse vertices at a time
+ROWS = 256  # whole rows of dense vertices at a time
 
 
 def huang2010_parts(
@@ -45,22 +49,29 @@ def huang2010_parts(
     progress: bool,
     checkpoint: Path | None = None,
 ) -> Parts:
-    """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``."""
+    """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``.
+
+    Raises
+    ------
+    PrtError
+        If the whole rows of the dense vertices, of which L1 minimization makes its equations, do not fit into memory.
+    """
     grid = AngularGrid(direct.lighting)
+    fractions = {mesh.name: DENSE_GROUND if _flat(scene, mesh) else DENSE_MODEL for mesh in scene.meshes}
+    _refuse_what_does_not_fit(scene, fractions, direct, indirect)
     sampler = DenseSampler(scene, direct, grid, clock)
     for mesh in scene.meshes:
-        sampler.choose(mesh, DENSE_GROUND if _flat(scene, mesh) else DENSE_MODEL, RADIUS, seed)
+        sampler.choose(mesh, fractions[mesh.name], RADIUS, seed)
     dense = sampler.dense()
     visibility = Visibility(dense.rows.visible, scene.normals[dense.ids], direct.lighting)
-    interreflected = None
+    interreflected, kept = None, None
     if indirect is not None:
         with clock.phase("dense_paths"):
-            rows, kept = indirect_of(indirect, dense.ids, grid.texels, "indirect", progress, checkpoint)
-        interreflected = Indirect(rows.mean.astype(np.float16), grid.upsampling, direct.lighting)
+            interreflected, kept = _interreflected(indirect, dense, grid, progress, checkpoint)
     weights, evaluated, sparse = _fitted(
         scene, direct, indirect, dense, visibility, interreflected, clock, progress
     )
-    if indirect is not None and kept:
+    if kept:
         kept.remove()
     quarter = np.zeros(direct.lighting.n_directions, bool)
     quarter[grid.texels] = True
@@ -88,6 +99,29 @@ def huang2010_parts(
     )
 
 
+def _refuse_what_does_not_fit(
+    scene: Scene, fractions: dict[str, float], direct: DirectTransport, indirect: PathTransport | None
+) -> None:
+    """Before anything is traced: whole rows of all dense vertices and channels, and their means, in float32."""
+    n_dense = sum(fractions[mesh.name] * (mesh.vertices.stop - mesh.vertices.start) for mesh in scene.meshes)
+    channels = indirect.channels if indirect else 1
+    needed = n_dense * direct.lighting.n_directions * 4 * (channels + (channels > 1))
+    available = psutil.virtual_memory().available
+    if needed > available:
+        raise PrtError(
+            f'method "huang2010" needs {needed / 1e9:.1f} GB for rows of {n_dense:.0f} dense vertices but '
+            f'{available / 1e9:.1f} GB are free; lower the resolution of the lighting, or set method="sparse"'
+        )
+
+
+def _interreflected(
+    solver: PathTransport, dense: Dense, grid: AngularGrid, progress: bool, checkpoint: Path | None
+) -> tuple[Indirect, Checkpoint | None]:
+    """Indirect light of the dense vertices, and the file of finished rows; their variances are not kept."""
+    rows, kept = indirect_of(solver, dense.ids, grid.texels, "indirect", progress, checkpoint)
+    return Indirect(rows.mean.astype(np.float16), grid.upsampling, solver.lighting), kept
+
+
 def _flat(scene: Scene, mesh: Mesh) -> bool:
     """Whether a mesh is a plane: the paper's ground."""
     normals = scene.normals[mesh.vertices]
@@ -110,12 +144,7 @@ def _fitted(
     is_sparse[dense.ids] = False
     sparse = np.flatnonzero(is_sparse)
     with clock.phase("system"):
-        rows = visibility.rows(np.arange(len(dense.ids)))
-        if interreflected is not None:
-            rows = rows + interreflected.rows(np.arange(len(dense.ids)))
-        # [dense vertex, channel * direction]: channels share the weights
-        stacked = np.ascontiguousarray(np.moveaxis(rows, 2, 1).reshape(len(rows), -1))
-        mean = np.ascontiguousarray(rows.mean(axis=2))
+        stacked, mean = whole_rows(visibility, interreflected)
     owners, columns, values = [dense.ids], [np.arange(len(dense.ids))], [np.ones(len(dense.ids))]
     cost = np.zeros(len(sparse), np.int64)
     with tqdm(total=len(sparse), desc="sparse", unit=" vertices", disable=not progress) as bar:
@@ -142,6 +171,40 @@ def _fitted(
         (np.concatenate(owners), np.concatenate(columns)),
     )
     return scipy.sparse.coo_array(entries, shape=(n, len(dense.ids))).tocsr(), cost, sparse
+
+
+def whole_rows(
+    visibility: Visibility, interreflected: Indirect | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Whole rows of white transport: dense vertices, from which L1 minimization has its equations.
+
+    Parameters
+    ----------
+    visibility : Visibility
+        Of the dense vertices, n_dense rows.
+    interreflected : Indirect or None
+        Of the same vertices.
+
+    Returns
+    -------
+    stacked : (n_dense, channels * n_directions) float32
+        Channel after channel. This is the greatest array of the method, so it is filled block by block.
+    mean : (n_dense, n_directions) float32
+        Over the channels; ``stacked`` itself if there is one.
+    """
+    n, n_directions = len(visibility.bits), visibility.lighting.n_directions
+    channels = interreflected.density.shape[2] if interreflected else 1
+    stacked = np.empty((n, channels * n_directions), np.float32)
+    mean = stacked if channels == 1 else np.empty((n, n_directions), np.float32)
+    for a in range(0, n, ROWS):
+        ids = np.arange(a, min(a + ROWS, n))
+        rows = visibility.rows(ids)  # [dense vertex, direction, channel]
+        if interreflected is not None:
+            rows = rows + interreflected.rows(ids)
+        stacked[ids] = np.moveaxis(rows, 2, 1).reshape(len(ids), -1)
+        if channels > 1:
+            mean[ids] = rows.mean(axis=2)
+    return stacked, mean
 
 
 def _near(scene: Scene, ids: NDArray[np.int64], dense: Dense) -> NDArray[np.int32]:

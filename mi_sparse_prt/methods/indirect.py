@@ -21,8 +21,8 @@ from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import Indirect, Interpolated
 from mi_sparse_prt.methods.dense import Dense, indirect_of
 from mi_sparse_prt.methods.neighbourhoods import Neighbourhood
-from mi_sparse_prt.reconstruction.low_rank import denoised
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
+from mi_sparse_prt.reconstruction.low_rank import LowRank, denoised, smoothed
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights
 from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
@@ -31,7 +31,6 @@ from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.path import PathTransport
 
 NEIGHBOURS = 10
-SMOOTHING = 16  # neighbours by which dense rows are smoothed
 PILOT = 512  # sparse vertices of a mesh that tell whether samples help
 LEAST_NOISE = 0.1  # of a sample, in means of all: a few paths may agree by chance
 BLOCK = 4096  # sparse vertices at a time
@@ -72,12 +71,12 @@ def indirect_part(
     Interpolated, int
         The part, and how many of its elements were evaluated.
     """
-    density, noise, kept = _dense_rows(scene, solver, dense, grid, clock, progress, checkpoint)
+    with clock.phase("solver"):
+        priors = [_prior(scene, group, dense) for group in groups]
+    density, noise, kept = _dense_rows(solver, dense, groups, priors, grid, clock, progress, checkpoint)
     fit = _Fit(solver, density, noise, evaluated, grid, clock)
     counts, columns, values = [], [], []
-    for group in groups:  # meshes follow each other, and so do rows
-        with clock.phase("solver"):
-            near, prior = _prior(scene, group, dense)
+    for group, (near, prior) in zip(groups, priors, strict=True):  # meshes follow each other, and so do rows
         corrected = fit.corrected(group, near, prior, progress)
         present = near.ids >= 0
         counts.append(present.sum(axis=1))
@@ -94,9 +93,10 @@ def indirect_part(
 
 
 def _dense_rows(
-    scene: Scene,
     solver: PathTransport,
     dense: Dense,
+    groups: list[Neighbourhood],
+    priors: list[tuple[Neighbours, NDArray[np.float32]]],
     grid: AngularGrid,
     clock: Stopwatch,
     progress: bool,
@@ -108,64 +108,64 @@ def _dense_rows(
     """
     density = np.empty((len(dense.ids), len(grid.texels), solver.channels), np.float32)
     noise, files = np.empty(len(dense.ids)), []
-    for number, mesh in enumerate(scene.meshes):
-        chosen = dense.of_mesh(mesh)
+    for number, (group, prior) in enumerate(zip(groups, priors, strict=True)):
+        chosen = dense.of_mesh(group.mesh)
         # by key: sums over rows then round alike in whatever order vertices come
         chosen = chosen[np.argsort(solver.points.keys[dense.ids[chosen]], kind="stable")]
         # other vertices would be dense for another fraction
         path = checkpoint and checkpoint.with_suffix(f".{number}.{len(dense.ids)}{checkpoint.suffix}")
         with clock.phase("dense_paths"):
             rows, kept = indirect_of(
-                solver, dense.ids[chosen], grid.texels, f"indirect {mesh.name}", progress, path
+                solver, dense.ids[chosen], grid.texels, f"indirect {group.mesh.name}", progress, path
             )
         files += [kept] if kept else []
         with clock.phase("low_rank"):
             noise[chosen] = rows.variance.mean(axis=(1, 2))
-            smoothing = _smoothing(scene, dense.ids[chosen])
+            smoothing = _smoothing(dense, chosen, dense.ids[chosen] - group.mesh.vertices.start, *prior)
             for c in range(solver.channels):
                 mean, variance = rows.mean[..., c], rows.variance[..., c]
-                density[chosen, :, c] = _with_sums_of(mean, _freed_of_noise(mean, variance, smoothing))
+                density[chosen, :, c] = _with_sums_of(mean, smoothed(denoised(mean, variance), smoothing))
     return density, noise, files
 
 
-def _smoothing(scene: Scene, ids: NDArray[np.int64]) -> scipy.sparse.csr_array:
-    """Weights (n, n) by which rows of some vertices of a mesh are smoothed along the surface."""
-    p, n = scene.normalised_positions[ids], scene.normals[ids]
-    near = surface_neighbours(p, n, p, n, SMOOTHING)
-    weights, present = linear_weights(near, p, n, p, n), near.ids >= 0
+def _smoothing(
+    dense: Dense,
+    chosen: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    near: Neighbours,
+    prior: NDArray[np.float32],
+) -> scipy.sparse.csr_array:
+    """Weights (n, n) among the chosen dense vertices of a mesh: those by which other vertices are interpolated."""
+    place = np.empty(len(dense.ids), np.int32)
+    place[chosen] = np.arange(len(chosen))
+    ids, weights = near.ids[rows], prior[rows]
+    present = ids >= 0
     starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    return scipy.sparse.csr_array((weights[present], near.ids[present], starts), shape=(len(ids), len(ids)))
+    return scipy.sparse.csr_array(
+        (weights[present], place[ids[present]], starts), shape=(len(rows), len(rows))
+    )
 
 
-def _freed_of_noise(
-    rows: NDArray[np.float32], variance: NDArray[np.float32], smoothing: scipy.sparse.csr_array
-) -> NDArray[np.float32]:
-    """Low rank first, smoothed along the surface; then what of the rest rises above the noise.
-
-    A single step keeps less of what is local, and more noise where rows hardly change.
-    """
-    smooth = smoothing @ denoised(rows, variance)[0]
-    return np.asarray(smooth + denoised(rows - smooth, variance)[0], np.float32)
-
-
-def _with_sums_of(rows: NDArray[np.float32], shrunk: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add what the sums of rows and of columns lack, in the proportions of the other columns and rows.
+def _with_sums_of(rows: NDArray[np.float32], low_rank: LowRank) -> NDArray[np.float32]:
+    """The matrix of low rank, and what its sums of rows and columns lack, in the proportions of columns and rows.
 
     Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: a mesh gets what it should
     from every direction, a vertex what it should under even light.
     """
-    by_column, by_row = shrunk.sum(axis=0), shrunk.sum(axis=1)
+    left, right = low_rank.left, low_rank.right
+    by_column, by_row = left.sum(axis=0) @ right, left @ right.sum(axis=1)
     total = float(by_row.sum())
     if total <= 0:
-        return shrunk
+        return low_rank.matrix()
     of_rows, of_columns = rows.sum(axis=1) - by_row, rows.sum(axis=0) - by_column
     of_columns -= of_rows.sum() / total * by_column  # what the rows get is shared out among columns
-    factors = np.stack([of_rows, by_row], axis=1), np.stack([by_column, of_columns]) / total
-    return np.asarray(shrunk + factors[0] @ factors[1], np.float32)
+    return np.hstack([left, of_rows[:, None], by_row[:, None]]) @ np.vstack(
+        [right, by_column / total, of_columns / total]
+    )
 
 
 def _prior(scene: Scene, group: Neighbourhood, dense: Dense) -> tuple[Neighbours, NDArray[np.float32]]:
-    """Neighbours and weights (n, k) of all vertices of a mesh; dense rows are smoothed by their neighbours'."""
+    """Neighbours and weights (n, k) of all vertices of a mesh, the dense ones among them."""
     p, n, inside = scene.normalised_positions, scene.normals, group.mesh.vertices
     near = Neighbours(group.near.ids[:, :NEIGHBOURS], group.near.distances[:, :NEIGHBOURS])
     return near, linear_weights(near, p[inside], n[inside], p[dense.ids], n[dense.ids])

@@ -29,6 +29,7 @@ from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
 DENSE = 0.22  # of the vertices of a mesh
+STEP = DENSE / 4  # of them in an iteration
 POWER = 1.5  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
@@ -67,16 +68,16 @@ def sparse_parts(
     grid = AngularGrid(direct.lighting)
     sampler = DenseSampler(scene, direct, grid, clock)
     for mesh in scene.meshes:
-        sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed, POWER)
+        sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed, POWER, STEP)
     dense, groups = neighbourhoods(scene, sampler, clock)
 
     state = _Visibility(direct, dense, clock)
     for group in groups:
-        state.reconstruct(group)
+        unknown = state.agree(group)
         with clock.phase("repair"):
             near = group.around_sparse(scene)
         for _ in range(ROUNDS):
-            state.repair(group, near)
+            state.repair(group, near, unknown)
 
     part, paths = None, 0
     if indirect is not None:
@@ -99,19 +100,25 @@ class _Visibility:
         self._direct, self._dense, self._clock = direct, dense, clock
         with clock.phase("consensus"):
             self.above = above_horizon(direct.points.normals, direct.lighting.directions)
-            self.visible, self.evaluated = np.zeros_like(self.above), np.zeros_like(self.above)
+            self.visible, self.evaluated = np.empty_like(self.above), np.zeros_like(self.above)
             self.visible[dense.ids] = dense.rows.visible
             self.evaluated[dense.ids] = dense.rows.evaluated
 
-    def reconstruct(self, group: Neighbourhood) -> None:
-        """Rows of sparse vertices: what their neighbours agree on, and traced rays elsewhere."""
+    def agree(self, group: Neighbourhood) -> Bits:
+        """Rows of sparse vertices: what their neighbours agree on, and traced rays elsewhere.
+
+        Returns the directions above the horizon in which no ray was traced, (n_sparse, words).
+        """
         rows = self._dense.rows
         with self._clock.phase("consensus"):
-            differ, agreed = contested(group.near_sparse, rows.visible, rows.above, self.above[group.sparse])
+            unknown = self.above[group.sparse]
+            differ, agreed = contested(group.near_sparse, rows.visible, rows.above, unknown)
             self.visible[group.sparse] = agreed
             self._trace(group.sparse, differ)
+            unknown ^= differ
+        return unknown
 
-    def repair(self, group: Neighbourhood, near: NDArray[np.int32]) -> None:
+    def repair(self, group: Neighbourhood, near: NDArray[np.int32], unknown: Bits) -> None:
         """Trace where the nearest of all vertices differ: they are nearer than the dense ones, and know more by now.
 
         Parameters
@@ -119,11 +126,14 @@ class _Visibility:
         group : Neighbourhood
         near : (n_sparse, k) int32
             Vertices of the mesh, counted from its first.
+        unknown : (n_sparse, words) uint32 bits
+            Directions in which no ray was traced; those that are now are taken out.
         """
         inside = group.mesh.vertices
         with self._clock.phase("repair"):
-            differ, _ = contested(near, self.visible[inside], self.above[inside], self.above[group.sparse])
-            self._trace(group.sparse, differ & ~self.evaluated[group.sparse])
+            differ, _ = contested(near, self.visible[inside], self.above[inside], unknown)
+            self._trace(group.sparse, differ)
+            unknown ^= differ
 
     def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> None:
         """Evaluate and keep elements (n, words)."""

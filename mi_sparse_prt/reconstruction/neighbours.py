@@ -123,18 +123,42 @@ def surface_neighbours(
     reach, short = count, np.arange(len(p))
     while len(short):
         found = _nearest(points[short], dense, reach, np.inf)
-        agree = found.ids >= 0
-        if len(dense_n):  # the padding, -1, reads some vertex; it is left out all the same
-            agree &= np.einsum("nx,nkx->nk", n[short], dense_n[found.ids]) > LEAST_COSINE
-        # those that agree come first, and stay in the order of distance
-        order = np.argsort(~agree, axis=1, kind="stable")[:, :count]
-        kept = np.take_along_axis(agree, order, axis=1)
-        ids[short] = np.where(kept, np.take_along_axis(found.ids, order, axis=1), -1)
-        distances[short] = np.where(kept, np.take_along_axis(found.distances, order, axis=1), np.inf)
+        complete = _take_agreeing(found.ids, found.distances, short, n, dense_n, ids, distances)
         if reach >= min(len(dense), WIDEST_SEARCH * count):
             break
-        reach, short = 2 * reach, short[~kept.all(axis=1)]
+        reach, short = 2 * reach, short[~complete]
     return Neighbours(ids, distances)
+
+
+@numba.njit(parallel=True, cache=True)
+def _take_agreeing(
+    found: NDArray[np.int32],
+    found_distances: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    dense_normals: NDArray[np.float64],
+    ids: NDArray[np.int32],
+    distances: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Put the first of those found whose normals agree into `rows` of ids and distances, and say which are full.
+
+    What the rows held before is overwritten.
+    """
+    complete = np.empty(len(rows), np.bool_)
+    for i in numba.prange(len(rows)):
+        row, taken = rows[i], 0
+        n = normals[row]
+        for k in range(found.shape[1]):
+            near = found[i, k]
+            if near < 0 or taken == ids.shape[1]:
+                break
+            m = dense_normals[near]
+            if n[0] * m[0] + n[1] * m[1] + n[2] * m[2] > LEAST_COSINE:
+                ids[row, taken] = near
+                distances[row, taken] = found_distances[i, k]
+                taken += 1
+        complete[i] = taken == ids.shape[1]
+    return complete
 
 
 def linear_weights(
@@ -237,7 +261,9 @@ def _nearest(points: NDArray[np.float64], dense: NDArray[np.float64], k: int, ra
     bound = math.nextafter(radius, math.inf) + 1e-150
     near, rows = tree.query(points, k=np.arange(1, asked + 1), distance_upper_bound=bound, workers=-1)
     distances[:, :asked] = near
-    ids[:, :asked] = np.append(order, -1)[rows]  # the tree's word for nothing is one row past its last
+    ids[:, :asked] = np.append(order, -1).astype(np.int32)[
+        rows
+    ]  # the tree's word for nothing is one row past its last
     return Neighbours(ids, distances)
 
 
@@ -251,7 +277,10 @@ def _spacing(dense_positions: NDArray[np.float64]) -> float:
 
     Vertices that share a position (seams) count once.
     """
-    places = np.unique(dense_positions, axis=0)
+    ordered = dense_positions[np.lexsort(dense_positions.T)]
+    first = np.ones(len(ordered), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    places = ordered[first]
     if len(places) < 2:
         return 0.0
     some = places[:: -(-len(places) // SPACINGS)]

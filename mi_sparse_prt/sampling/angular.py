@@ -80,7 +80,8 @@ class AngularGrid:
         above = above_horizon(normals, self.lighting.directions)
         first = above & pack(self._sampled)
         seen = scattered(first, visible(*listed(first)))
-        features, borrowed = _second_pass(first, seen, above, *self._stamps)
+        features, borrowed = np.empty_like(first), np.empty_like(first)
+        _second_pass(first, seen, above, *self._stamps, features, borrowed)
         seen |= borrowed | scattered(features, visible(*listed(features)))
         return DenseRows(seen, first | features, features, above)
 
@@ -144,10 +145,16 @@ class AngularGrid:
     def _shifted(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """The texel (dx, dy) beside each texel, and whether it is not beyond two edges at once."""
         n = self.lighting.resolution
-        s, t = (2 * (self._column + dx) + 1) / n - 1, (2 * (self._row + dy) + 1) / n - 1
-        s_axis, t_axis, centre = (FACE_FRAMES[self._face, axis] for axis in range(3))
-        texels = self.lighting.texel_of(centre + s[:, None] * s_axis + t[:, None] * t_axis)
-        return texels.astype(np.int64), ~((np.abs(s) > 1) & (np.abs(t) > 1))
+        column, row = self._column + dx, self._row + dy
+        texels = (self._face * n + row) * n + column
+        beside, above = (column < 0) | (column >= n), (row < 0) | (row >= n)
+        far = np.flatnonzero(beside | above)
+        if not len(far):
+            return texels, ~beside
+        s, t = (2 * column[far] + 1) / n - 1, (2 * row[far] + 1) / n - 1
+        s_axis, t_axis, centre = (FACE_FRAMES[self._face[far], axis] for axis in range(3))
+        texels[far] = self.lighting.texel_of(centre + s[:, None] * s_axis + t[:, None] * t_axis)
+        return texels, ~(beside & above)
 
 
 @numba.njit(parallel=True, cache=True)
@@ -158,12 +165,13 @@ def _second_pass(
     starts: NDArray[np.int64],
     stamp_words: NDArray[np.int32],
     stamp_masks: Bits,
-) -> tuple[Bits, Bits]:
-    """Features (to be sampled) and borrowed visibility of the directions that the first pass left out.
+    features: Bits,
+    borrowed: Bits,
+) -> None:
+    """Find features (to be sampled) and borrowed visibility of the directions that the first pass left out.
 
     A window with no sampled direction above the horizon says nothing: its direction is sampled as well.
     """
-    features, borrowed = np.empty_like(first), np.empty_like(first)
     words = first.shape[1]
     for i in numba.prange(len(first)):
         near = np.zeros((2, words), np.uint32)  # [dark or lit, word]
@@ -180,4 +188,3 @@ def _second_pass(
             dark, lit, asked = near[0, w], near[1, w], above[i, w] & ~first[i, w]
             features[i, w] = asked & ~(dark ^ lit)
             borrowed[i, w] = asked & lit & ~dark
-    return features, borrowed

@@ -1,4 +1,8 @@
-"""Rows of yes-or-no answers, one bit per direction: bit j % 32 of word j // 32, as ``DirectTransport`` packs them."""
+"""Rows of yes-or-no answers, one bit per direction: bit j % 32 of word j // 32, as ``DirectTransport`` packs them.
+
+What compiled functions fill is made by NumPy: it asks the system for huge pages, and numba does not. Half the time of
+``listed`` went into page faults.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +23,14 @@ def above_horizon(normals: NDArray[np.float32], directions: NDArray[np.float32])
     words = -(-len(directions) // BITS)
     padded = np.zeros((3, words * BITS), np.float32)  # a direction of zeros is above no horizon
     padded[:, : len(directions)] = np.asarray(directions).T
-    return _above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS))
+    bits = np.empty((len(normals), words), np.uint32)
+    _above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
+    return bits
 
 
 @numba.njit(parallel=True, cache=True)
-def _above(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> Bits:
+def _above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
     """Of directions (3, words, 32); without branches, so that a word takes a few vector instructions."""
-    bits = np.empty((len(normals), directions.shape[1]), np.uint32)
     x, y, z = directions[0], directions[1], directions[2]
     for i in numba.prange(len(normals)):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -35,7 +40,6 @@ def _above(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> Bit
                 cosine = nx * x[w, k] + ny * y[w, k] + nz * z[w, k]
                 word |= np.uint32(cosine > 0) << np.uint32(k)
             bits[i, w] = word
-    return bits
 
 
 def pack(mask: NDArray[np.bool_]) -> Bits:
@@ -81,12 +85,17 @@ def counts(bits: Bits) -> NDArray[np.int64]:
 
 def listed(bits: Bits) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """Row and direction of every set bit, row after row: two (m,) arrays."""
-    return _fill(bits, _starts(bits))
+    starts = _starts(bits)
+    rows, directions = np.empty(starts[-1], np.uint32), np.empty(starts[-1], np.uint32)
+    _fill(bits, starts, rows, directions)
+    return rows, directions
 
 
 def scattered(mask: Bits, values: NDArray[np.bool_]) -> Bits:
     """The inverse of ``listed``: those bits of ``mask`` whose listed value is true, (n, words)."""
-    return _scatter(mask, _starts(mask), values)
+    result = np.empty_like(mask)
+    _scatter(mask, _starts(mask), values, result)
+    return result
 
 
 def _starts(bits: Bits) -> NDArray[np.int64]:
@@ -95,9 +104,9 @@ def _starts(bits: Bits) -> NDArray[np.int64]:
 
 
 @numba.njit(parallel=True, cache=True)
-def _fill(bits: Bits, starts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    rows = np.empty(starts[-1], np.uint32)
-    directions = np.empty(starts[-1], np.uint32)
+def _fill(
+    bits: Bits, starts: NDArray[np.int64], rows: NDArray[np.uint32], directions: NDArray[np.uint32]
+) -> None:
     for i in numba.prange(len(bits)):
         at = starts[i]
         rows[at : starts[i + 1]] = i
@@ -107,12 +116,10 @@ def _fill(bits: Bits, starts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], ND
                 directions[at] = np.uint32(w * BITS) + lowest(left)  # type: ignore[call-arg]
                 at += 1
                 left &= left - np.uint32(1)
-    return rows, directions
 
 
 @numba.njit(parallel=True, cache=True)
-def _scatter(mask: Bits, starts: NDArray[np.int64], values: NDArray[np.bool_]) -> Bits:
-    result = np.empty(mask.shape, np.uint32)
+def _scatter(mask: Bits, starts: NDArray[np.int64], values: NDArray[np.bool_], result: Bits) -> None:
     for i in numba.prange(len(mask)):
         at = starts[i]
         for w in range(mask.shape[1]):
@@ -122,7 +129,6 @@ def _scatter(mask: Bits, starts: NDArray[np.int64], values: NDArray[np.bool_]) -
                 at += 1
                 left &= left - np.uint32(1)
             result[i, w] = word
-    return result
 
 
 def overwrite(

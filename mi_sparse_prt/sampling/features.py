@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.sampling.bits import Bits
 
 
-@numba.njit(parallel=True, cache=True)
-def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: Bits) -> tuple[Bits, Bits]:
+def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, asked: Bits) -> tuple[Bits, Bits]:
     """Directions in which a vertex's neighbours differ or know nothing, and what they agree on elsewhere.
 
     The limit of [HR10] 5.2 for binary visibility: the variance among the neighbours is not zero. All such directions
@@ -22,17 +21,25 @@ def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: 
         Rows of ``visible`` and ``known``; -1 where there are fewer.
     visible, known : (m, words) uint32 bits
         Visibility of the neighbours, and the directions in which it is known (above their horizon).
-    above : (n, words) uint32 bits
-        Directions above the vertices' own horizon.
+    asked : (n, words) uint32 bits
+        Directions that matter: above the vertices' own horizon.
 
     Returns
     -------
     differ, agreed : (n, words) uint32 bits
-        Directions to sample; and those in which all that know see the sky. Nothing below the horizon.
+        Of those asked for, directions to sample; and those in which all that know see the sky.
     """
-    differ, agreed = np.empty_like(above), np.empty_like(above)
-    words = above.shape[1]
-    for i in numba.prange(len(above)):
+    differ, agreed = np.empty_like(asked), np.empty_like(asked)
+    _contested(neighbours, visible, known, asked, differ, agreed)
+    return differ, agreed
+
+
+@numba.njit(parallel=True, cache=True)
+def _contested(
+    neighbours: NDArray[np.int32], visible: Bits, known: Bits, asked: Bits, differ: Bits, agreed: Bits
+) -> None:
+    words = asked.shape[1]
+    for i in numba.prange(len(asked)):
         lit, dark = np.zeros(words, np.uint32), np.zeros(words, np.uint32)
         for k in range(neighbours.shape[1]):
             row = neighbours[i, k]
@@ -43,9 +50,8 @@ def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: 
                 lit[w] |= seen[w]
                 dark[w] |= knows[w] & ~seen[w]
         for w in range(words):
-            differ[i, w] = above[i, w] & ~(lit[w] ^ dark[w])
-            agreed[i, w] = above[i, w] & lit[w] & ~dark[w]
-    return differ, agreed
+            differ[i, w] = asked[i, w] & ~(lit[w] ^ dark[w])
+            agreed[i, w] = asked[i, w] & lit[w] & ~dark[w]
 
 
 @numba.njit(parallel=True, cache=True)

@@ -19,6 +19,7 @@ ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its ran
 RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box
 ROUNDING = 1e-9  # of the energy: 99 of 100 equal singular values hold 0.99, whatever their last bits
 LEAST_DENSE = 2  # vertices of a mesh
+SHARING = 2  # one in so many of the first iteration's vertices is the centre of a local matrix
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ def choose_dense(
 ) -> SpatialSamples:
     """Choose the dense vertices of one mesh in iterations, by the local rank of what is known so far ([HR10] 4.1).
 
-    The first iteration takes `step` of the vertices at random; they are the centres of local matrices. Each later one
-    computes the ranks of these and draws `step` more by rank, until there are `fraction` of them.
+    The first iteration takes `step` of the vertices at random; half of them are the centres of local matrices. Each
+    later one computes the ranks of these and draws `step` more by rank, until there are `fraction` of them.
 
     Parameters
     ----------
@@ -110,10 +111,11 @@ def choose_dense(
     while True:
         start = time.perf_counter()
         if len(dense) == 1:  # shared matrices: a vertex takes the rank around the nearest of the first ones
-            owner = radius_neighbours(p, p[dense[0]], np.inf, 1).ids[:, 0]
+            centres = p[dense[0][::SHARING]]
+            owner = radius_neighbours(p, centres, np.inf, 1).ids[:, 0]
         if len(dense):
             known, chosen = np.concatenate(bits), np.concatenate(dense)
-            ranks = local_ranks_at(p[dense[0]], known, p[chosen], radius, k)[owner].astype(np.float32)
+            ranks = local_ranks_at(centres, known, p[chosen], radius, k)[owner].astype(np.float32)
         seconds["rank"] += time.perf_counter() - start
 
         start = time.perf_counter()

@@ -78,13 +78,15 @@ class PathTransport:
         return max(1, self.block_elements // self.lighting.n_directions)
 
     def any_hit(self, rays_per_point: int) -> bool:
-        """Whether any of a few cosine-distributed rays per point meets a surface."""
-        lane = dr.arange(mi.UInt32, len(self.points) * rays_per_point)
-        point = lane // rays_per_point
-        rng = random_generator(
-            self._points.key(point), mi.UInt32(0), lane - point * rays_per_point, self.seed
-        )
-        return bool(dr.any(self.scene.ray_test(self._first_ray(point, rng))))
+        """Whether any of a few cosine-distributed rays per point meets a surface; often the first ones tell."""
+        for a, b in ((0, 1), (1, rays_per_point)):
+            lane = dr.arange(mi.UInt32, len(self.points) * (b - a))
+            point = lane // (b - a)
+            sample = lane - point * (b - a) + a
+            rng = random_generator(self._points.key(point), mi.UInt32(0), sample, self.seed)
+            if dr.any(self.scene.ray_test(self._first_ray(point, rng))):
+                return True
+        return False
 
     def rows(self, point_ids: NDArray[np.integer]) -> Estimate:
         """Whole rows: mean and variance (len(point_ids), n_directions, channels), see ``elements``."""

@@ -1,4 +1,14 @@
-"""How good a matrix is, from elements that it was not made of: no reference render is needed."""
+"""How good a matrix is, from elements that it was not made of: no reference render is needed.
+
+With T = D + S, direct and indirect light, and their true values d and s, an element's squared error is
+
+    (D - d)^2  +  2 (D - d)(S - s) + (S - s)^2.
+
+The first term is about visibility: often zero, sometimes large, and a ray tells. The other two need paths, and are
+about an average over many small errors. So each part has its own elements (see ``chosen``), and the two estimates are
+added. An element's noise is left out by its variance: if m is a mean of samples and v the estimated variance of that
+mean, (S - m)^2 - v estimates (S - s)^2.
+"""
 
 from __future__ import annotations
 
@@ -8,185 +18,167 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.validation.chosen import Chosen, for_direct_light, for_indirect_light
+from mi_sparse_prt.validation.elements import AnyPart, elements
 
-SPP = 64
+SPP = 512
 STRATA = 4  # shadow rays per axis of a texel
 ROUNDING = 1e-5  # relative errors below are those of float32
 
 
-class HeldOut:
-    """Random elements of T, evaluated twice, independently of each other and of any matrix.
+@dataclass(frozen=True)
+class Sample:
+    """Elements that stand for a mesh in one sum over it.
 
-    With the two values X and Y, the mean of (T - X)(T - Y) estimates the squared error of a matrix T without the
-    noise of X and Y, and that of X Y the squared norm.
+    Attributes
+    ----------
+    weights : (m,) float64
+        How many elements each stands for.
+    squares, norms : (m,) float64
+        Unbiased estimates of what each adds to the squared error and the squared norm, summed over channels.
+    """
+
+    weights: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    norms: NDArray[np.float64]
+
+
+def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> dict[str, Any]:
+    """Estimate the relative L2 error of a matrix.
 
     Parameters
     ----------
     scene : Scene
-    lighting : CubemapLighting
-    basis : {"direction", "texel"}
+    transport : LightTransport
+        Of this scene, rows in the order of its vertices; its albedo is the scene's.
     max_depth : int
-        As for ``precompute``.
-    indirect : bool
-        Whether there is indirect light.
+        As for ``precompute``. Where the matrix has no indirect light, none is expected.
     seed : int
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
-    vertices_per_mesh, texels_per_vertex : int
 
-    Attributes
-    ----------
-    vertices : (k,) integers
-        Sorted; of all meshes.
-    texels : (k, t) integers
-        Texels held out at each vertex.
+    Returns
+    -------
+    dict
+        ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes`` again,
+        from the spread between elements; where no element is wrong, as if an average one were), ``elements`` (how
+        many were evaluated).
     """
+    judge, rng = _Judge(scene, transport, max_depth, seed), np.random.default_rng([seed, 1])
+    samples: dict[str, list[Sample]] = {}
+    count = 0
+    for mesh in transport.meshes:
+        lit = for_direct_light(transport, scene.normals, mesh.vertices, rng)
+        samples[mesh.name] = [judge.direct(lit)]
+        seen = [lit]
+        if transport.indirect is not None:
+            seen.append(for_indirect_light(transport, mesh.vertices, rng))
+            samples[mesh.name].append(judge.indirect(seen[1]))
+        count += _distinct(seen, transport.lighting.n_directions)
+    meshes = {name: relative(found) for name, found in samples.items()}
+    total = relative([sample for found in samples.values() for sample in found])
+    return {
+        "total": total[0],
+        "meshes": {name: value for name, (value, _) in meshes.items()},
+        "standard_error": {
+            "total": total[1],
+            "meshes": {name: error for name, (_, error) in meshes.items()},
+        },
+        "elements": count,
+    }
 
-    def __init__(
-        self,
-        scene: Scene,
-        lighting: CubemapLighting,
-        basis: str,
-        max_depth: int,
-        indirect: bool,
-        seed: int,
-        vertices_per_mesh: int = 256,
-        texels_per_vertex: int = 32,
-    ) -> None:
-        rng = np.random.default_rng([seed, 1])
-        self._sizes = {m.name: m.vertices.stop - m.vertices.start for m in scene.meshes}
-        self._inside: dict[str, slice] = {}
-        chosen: list[NDArray[np.int64]] = []
-        for mesh in scene.meshes:
-            count = min(self._sizes[mesh.name], vertices_per_mesh)
-            start = sum(len(c) for c in chosen)
-            self._inside[mesh.name] = slice(start, start + count)
-            chosen.append(
-                mesh.vertices.start + np.sort(rng.choice(self._sizes[mesh.name], count, replace=False))
-            )
-        self.vertices = np.concatenate(chosen)
-        n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
-        self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
-        depth = max_depth if indirect else 2
-        self._x, self._y = (
-            _elements(scene, lighting, basis, depth, self.vertices, self.texels, (seed << 2) + k)
-            for k in (2, 3)
+
+class _Judge:
+    """Compares elements of a matrix with true ones."""
+
+    def __init__(self, scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> None:
+        self._transport, self._albedo = transport, scene.albedo.astype(np.float64)
+        points, lighting = vertex_points(scene), transport.lighting
+        self._seeds = [(seed << 3) + k for k in (2, 3, 4)]  # none is the matrix's own
+        self._rays = DirectTransport(
+            scene.normalised, lighting, points, transport.basis, STRATA, self._seeds[0]
+        )
+        self._paths = PathTransport(
+            scene.normalised,
+            lighting,
+            points,
+            transport.basis,
+            max_depth,
+            SPP,
+            1 if scene.grey else 3,
+            self._seeds[2],
         )
 
-    def error(self, elements: NDArray[np.floating]) -> dict[str, Any]:
-        """Relative L2 error of a matrix of which these are the held-out elements.
+    def direct(self, chosen: Chosen) -> Sample:
+        """Squared errors and norms of direct light alone."""
+        x, y = self._halves(chosen)
+        ours = self._ours(self._transport.direct, chosen)[:, 0]
+        squared_albedo = (self._albedo[chosen.vertices] ** 2).sum(axis=1)
+        return Sample(chosen.weights, squared_albedo * (ours - x) * (ours - y), squared_albedo * x * y)
 
-        Parameters
-        ----------
-        elements : (k, t, 3) float
-            ``T[vertices[:, None], texels]``.
+    def indirect(self, chosen: Chosen) -> Sample:
+        """What indirect light adds to both: its square and twice its product with direct light."""
+        transport = self._transport
+        assert transport.indirect is not None
+        estimate = self._paths.elements(chosen.vertices, chosen.texels)
+        solid_angles = transport.lighting.solid_angles[chosen.texels].astype(np.float64)[:, None]
+        true = estimate.mean * solid_angles  # [element, channel]
+        variance = estimate.variance * solid_angles**2
+        direct = np.mean(self._halves(chosen), axis=0)[:, None]
+        error = self._ours(transport.indirect, chosen) - true
+        direct_error = self._ours(transport.direct, chosen) - direct
+        squared_albedo = self._albedo[chosen.vertices] ** 2
+        squares = squared_albedo * (error * (error + 2 * direct_error) - variance)
+        norms = squared_albedo * (true * (true + 2 * direct) - variance)
+        return Sample(chosen.weights, squares.sum(axis=1), norms.sum(axis=1))
 
-        Returns
-        -------
-        dict
-            ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes``
-            again, from the spread between vertices; where no element is wrong, as if an average one were),
-            ``elements`` (how many were evaluated).
-        """
-        squares, norms = self.squared_error(elements), self._squared_norm()
-        strata = {
-            name: _Stratum(squares[inside], norms[inside], self._sizes[name])
-            for name, inside in self._inside.items()
-        }
-        meshes = {name: _relative([stratum]) for name, stratum in strata.items()}
-        total = _relative(list(strata.values()))
-        return {
-            "total": total[0],
-            "meshes": {name: value for name, (value, _) in meshes.items()},
-            "standard_error": {
-                "total": total[1],
-                "meshes": {name: error for name, (_, error) in meshes.items()},
-            },
-            "elements": self.texels.size,
-        }
+    def _halves(self, chosen: Chosen) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """White direct light (m,) twice, independently; it is the same where one ray tells all."""
+        first = self._rays.elements(chosen.vertices, chosen.texels).astype(np.float64)
+        if self._transport.basis == "direction":
+            return first, first
+        second = self._rays.elements(chosen.vertices, chosen.texels, self._seeds[1])
+        return first, second.astype(np.float64)
 
-    def relative_square(self, values: NDArray[np.floating]) -> float:
-        """Sum over the whole matrix of a quantity known at the held-out elements, (k, t), over its squared norm."""
-        sums, norms = (self._total(v) for v in (values, self._squared_norm()))
-        return sums / max(norms, 1e-300)
-
-    def squared_error(self, elements: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Unbiased squared errors (k, t) of single elements (k, t, 3), summed over channels."""
-        return ((elements - self._x) * (elements - self._y)).sum(axis=2)
-
-    def _squared_norm(self) -> NDArray[np.float64]:
-        """Unbiased squared norms (k, t) of single elements, summed over channels."""
-        return (self._x * self._y).sum(axis=2)
-
-    def _total(self, values: NDArray[np.floating]) -> float:
-        """Of a quantity known at the held-out elements, (k, t), the sum over all vertices of its mean over texels."""
-        return sum(self._sizes[name] * float(values[inside].mean()) for name, inside in self._inside.items())
+    def _ours(self, part: AnyPart, chosen: Chosen) -> NDArray[np.float64]:
+        return elements(part, chosen.vertices, chosen.texels).astype(np.float64)
 
 
-@dataclass(frozen=True)
-class _Stratum:
-    """Squared errors and squared norms (k, t) of elements held out in a mesh of ``size`` vertices."""
+def relative(samples: list[Sample]) -> tuple[float, float]:
+    """Relative L2 and its standard error, from samples whose sums are added.
 
-    squares: NDArray[np.float64]
-    norms: NDArray[np.float64]
-    size: int
-
-
-def _elements(
-    scene: Scene,
-    lighting: CubemapLighting,
-    basis: str,
-    max_depth: int,
-    vertices: NDArray[np.int64],
-    texels: NDArray[np.int64],
-    seed: int,
-) -> NDArray[np.float64]:
-    """Elements of T, (k, t, 3), at the full resolution of the lighting."""
-    points, flat = vertex_points(scene), (np.repeat(vertices, texels.shape[1]), texels.ravel())
-    direct = DirectTransport(scene.normalised, lighting, points, basis, STRATA, seed)
-    white = np.repeat(direct.elements(*flat)[:, None].astype(np.float64), 3, axis=1)
-    if max_depth != 2:
-        path = PathTransport(
-            scene.normalised, lighting, points, basis, max_depth, SPP, 1 if scene.grey else 3, seed
-        )
-        white += path.elements(*flat).mean * lighting.solid_angles[texels.ravel()][:, None]
-    return scene.albedo[vertices][:, None] * white.reshape(*texels.shape, 3)
-
-
-def _relative(strata: list[_Stratum]) -> tuple[float, float]:
-    """Relative L2 and its standard error.
-
-    Its square R^2 is a ratio of two sums over meshes; to first order it spreads as e - R^2 n does between vertices, e
-    and n being the squared error and norm of a vertex (Cochran 1977, "Sampling Techniques", 6.11).
+    Its square R^2 is a ratio of two sums; to first order it spreads as the sum of e - R^2 n does, e and n being the
+    squared error and norm of an element (Cochran 1977, "Sampling Techniques", 6.11).
     """
-    norm = sum(s.size * float(s.norms.mean()) for s in strata)
-    square = sum(s.size * float(s.squares.mean()) for s in strata)
+    norm = sum(float((s.weights * s.norms).sum()) for s in samples)
+    square = sum(float((s.weights * s.squares).sum()) for s in samples)
     if norm <= 0:  # a black mesh
         return (0.0 if square <= 0 else 1.0), 0.0
     ratio = max(square, 0.0) / norm  # below zero is noise about zero
-    wrong = ratio > ROUNDING**2
-    variance = sum(s.size**2 * (_variance(s, ratio) if wrong else _one_element(s) ** 2) for s in strata)
-    relative, spread = float(np.sqrt(ratio)), float(np.sqrt(variance)) / norm
+    found, spread = float(np.sqrt(ratio)), float(np.sqrt(sum(_variance(s, ratio) for s in samples))) / norm
     # d sqrt(e) = de / (2 sqrt(e)); near zero the bound is that of sqrt(spread)
-    return relative, spread / (2 * relative) if ratio > spread else float(np.sqrt(spread))
+    return found, spread / (2 * found) if ratio > spread else float(np.sqrt(spread))
 
 
-def _variance(stratum: _Stratum, ratio: float) -> float:
-    """Variance of the mean of e - R^2 n over vertices.
+def _variance(sample: Sample, ratio: float) -> float:
+    """Variance of the sum of e - R^2 n, elements having been drawn independently of each other.
 
-    A few wrong elements may hold most of the squared error. Those who see few of them see too little spread as well,
-    so the worst vertex is counted once more.
+    A few wrong elements may hold most of the squared error. Samples with few of them see too little spread as well,
+    so the worst element is counted once more; where none is wrong, one average element may be.
     """
-    left = (stratum.squares - ratio * stratum.norms).mean(axis=1)  # [vertex]
-    spread = float(left.var(ddof=1)) / len(left) if len(left) > 1 else 0.0
-    return spread + float((left**2).max()) / len(left) ** 2
+    squares, norms = sample.weights * sample.squares, sample.weights * sample.norms
+    size = float(np.abs(norms).sum())
+    if np.abs(squares).sum() <= ROUNDING**2 * size:
+        return (float((norms**2).sum()) / max(size, 1e-300)) ** 2
+    left = (squares - ratio * norms) ** 2
+    return float(left.sum() + left.max())
 
 
-def _one_element(stratum: _Stratum) -> float:
-    """What one average element adds to the mean squared norm: if it alone is wrong, nobody need have seen it."""
-    norms = stratum.norms
-    return float((norms**2).sum() / max(norms.sum(), 1e-300)) / norms.size
+def _distinct(parts: list[Chosen], n_directions: int) -> int:
+    """How many different elements were chosen."""
+    places = np.sort(np.concatenate([p.vertices * n_directions + p.texels for p in parts]))
+    return int(np.count_nonzero(np.diff(places))) + bool(len(places))

@@ -1,5 +1,6 @@
 """The pipeline: its report, what it skips, what it refuses, and that a seed decides all."""
 
+import importlib
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ from conftest import GREY, build, diffuse, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.matrix import LightTransport, MeanCosine, Visibility
+from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 
 LIGHTING = prt.CubemapLighting(4)
@@ -78,6 +80,24 @@ def test_the_forecast_is_of_the_right_size(grey_scene, capsys):
     shown = capsys.readouterr()
     assert "313 vertices x 96 directions" in shown.out + shown.err
     assert "indirect" in shown.err
+
+
+@pytest.mark.parametrize(("method", "elements"), [("sparse", 0.097), ("huang2010", 0.113)])
+def test_the_forecast_of_few_elements(grey_scene, monkeypatch, capsys, method, elements):
+    """Where a path takes long, time goes as the elements do, of which these are the shares in large scenes.
+
+    Expected: about that share of the time of brute force. Of so small a matrix weights are a large part, which the
+    forecast of its size does not know.
+    """
+    pipeline = importlib.import_module("mi_sparse_prt.precompute")  # the package's own is the function
+    monkeypatch.setattr(
+        pipeline, "_seconds_per_row", lambda s: 10.0 if isinstance(s, PathTransport) else 0.01
+    )
+    transport = precompute(grey_scene, method=method, progress=True)
+    forecast = transport.report["forecast"]
+    assert forecast["seconds"] == pytest.approx(elements * 10 * 313, rel=0.25)
+    assert 0.1 * transport.nbytes < forecast["bytes"] < 1.5 * transport.nbytes
+    assert f"about {forecast['seconds']:.0f} s" in capsys.readouterr().out
 
 
 def test_quiet_without_progress(grey_scene, capsys):
@@ -218,6 +238,21 @@ def test_a_matrix_that_does_not_fit_is_refused_before_it_is_computed(grey_scene,
     monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
     with pytest.raises(prt.PrtError, match="GB"):
         precompute(grey_scene)
+
+
+def test_huang2010_refuses_rows_that_do_not_fit_before_it_samples_them(grey_scene, monkeypatch):
+    """Memory for the matrix (a kilobyte), and not for float32 rows of a quarter of 313 vertices."""
+
+    class Memory:
+        available = 20_000
+
+    def fail(*_: object) -> None:
+        raise AssertionError("rays were traced")
+
+    monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
+    monkeypatch.setattr(DirectTransport, "visible", fail)
+    with pytest.raises(prt.PrtError, match="huang2010.*GB"):
+        precompute(grey_scene, method="huang2010", max_depth=2)
 
 
 def test_a_target_error_is_met(grey_scene):

@@ -14,6 +14,7 @@ from mi_sparse_prt.hashing import hash_rows, mix
 from mi_sparse_prt.sampling.spatial import (
     ENERGY,
     ROUNDING,
+    SHARING,
     choose_dense,
     local_rank,
     local_ranks_at,
@@ -204,6 +205,7 @@ def test_iterations_add_up():
     assert [sorted(ids) for ids in asked.calls] == [ids.tolist() for ids in samples.iterations]
     assert samples.ranks.shape == (400,) and (samples.ranks >= 1).all()
     before, first = np.concatenate(samples.iterations[:-1]), samples.iterations[0]
+    first = first[np.argsort(hash_rows(p)[first])][::SHARING]  # centres of local matrices
     owner = np.argmin(np.linalg.norm(p[:, None] - p[first], axis=2), axis=1)
     apart = np.sort(np.linalg.norm(p[:, None] - p[first], axis=2), axis=1)
     clear = apart[:, 1] - apart[:, 0] > 1e-6  # of equally near ones either may be taken

@@ -1,0 +1,202 @@
+"""Which elements judge a matrix: at random, more often where its errors are likely to be, with weights that undo that.
+
+An element that is drawn with the probability p has the weight 1 / p, so that weighted sums over the drawn elements
+estimate, without bias, sums over all of them (Horvitz and Thompson 1952); only their variance depends on p.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.matrix import LightTransport, Visibility
+from mi_sparse_prt.sampling.bits import Bits
+from mi_sparse_prt.transport.direct import BITS
+from mi_sparse_prt.validation.elements import elements
+
+RAYS = 0.002  # of the elements of a mesh, for direct light ...
+FEWEST_RAYS = 1 << 16  # ... but as many as this, or a quarter of the mesh
+FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
+AROUND = 24  # texels: 5 x 5 without the middle
+NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
+BELOW_HORIZON = (
+    0.25  # added to the cosine where direct light is not stored as bits: it may be wrong there, too
+)
+FEW = 8  # times fewer rays in that case: hardly an element is without an error
+
+PATHS = 3072  # elements of a mesh for indirect light, at most 1 / 16 of it ...
+FEWEST_PATHS = 64  # ... or as many as this
+POOL = 8  # times as many, of which these are drawn
+EVEN = 0.2  # of them drawn without regard to the light that the matrix has there
+
+MEAN_COSINE = 0.25  # of max(0, n . w) over the sphere
+BLOCK = 1 << 14  # vertices at a time: some hundred trials each
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Elements of a mesh.
+
+    Attributes
+    ----------
+    vertices, texels : (m,) int64
+        Sorted by vertex.
+    weights : (m,) float64
+        How many elements of the mesh each stands for.
+    """
+
+    vertices: NDArray[np.int64]
+    texels: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+
+def for_direct_light(
+    transport: LightTransport, normals: NDArray[np.float32], inside: slice, rng: np.random.Generator
+) -> Chosen:
+    """Draw elements for direct light, at all vertices of a mesh: a few of them may hold most of the error.
+
+    At each vertex texels are drawn by cosine and solid angle. A bit is seldom wrong where all around it agree, so
+    only some of those are kept.
+
+    Parameters
+    ----------
+    transport : LightTransport
+    normals : (n_v, 3) float32
+        Of all vertices.
+    inside : slice
+        The vertices of the mesh.
+    rng : numpy.random.Generator
+    """
+    lighting, part = transport.lighting, transport.direct
+    total = (inside.stop - inside.start) * lighting.n_directions
+    rays = max(RAYS * total, min(total / 4, FEWEST_RAYS))
+    if not isinstance(part, Visibility):
+        return _by_cosine(lighting, normals, inside, rays / FEW, BELOW_HORIZON, rng)
+    drawn = rays / (NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES)
+    found = _by_cosine(lighting, normals, inside, drawn, 0.0, rng)
+    nearest = min(AROUND + 1, lighting.n_directions)
+    around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
+    near = _near_edges(
+        part.bits, normals, lighting.directions, around.astype(np.int32), found.vertices, found.texels
+    )
+    kept = near | (rng.random(len(near)) < FAR_FROM_EDGES)
+    weights = found.weights / np.where(near, 1.0, FAR_FROM_EDGES)
+    return Chosen(found.vertices[kept], found.texels[kept], weights[kept])
+
+
+def for_indirect_light(transport: LightTransport, inside: slice, rng: np.random.Generator) -> Chosen:
+    """Draw elements for indirect light, where the matrix has most of it: there its errors and the paths' noise are.
+
+    Parameters
+    ----------
+    transport : LightTransport
+        With indirect light.
+    inside : slice
+        The vertices of the mesh.
+    rng : numpy.random.Generator
+    """
+    assert transport.indirect is not None
+    total = (inside.stop - inside.start) * transport.lighting.n_directions
+    count = max(min(PATHS, total // 16), min(FEWEST_PATHS, total))
+    pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
+    vertices, texels = np.divmod(pool, transport.lighting.n_directions)
+    vertices += inside.start
+    light = np.abs(transport.albedo[vertices] * elements(transport.indirect, vertices, texels)).sum(axis=1)
+    mean = float(light.mean(dtype=np.float64))
+    density = EVEN + (1 - EVEN) * (light / mean if mean > 0 else np.ones(len(pool)))
+    probability = np.minimum(1.0, count / len(pool) * density.astype(np.float64))
+    kept = rng.random(len(pool)) < probability
+    return Chosen(vertices[kept], texels[kept], total / len(pool) / probability[kept])
+
+
+def _by_cosine(
+    lighting: CubemapLighting,
+    normals: NDArray[np.float32],
+    inside: slice,
+    count: float,
+    floor: float,
+    rng: np.random.Generator,
+) -> Chosen:
+    """About ``count`` elements, drawn by (cosine + floor) x solid angle: random texels, kept or rejected by that."""
+    directions, areas = lighting.directions, lighting.solid_angles / lighting.solid_angles.max()
+    n, parts = inside.stop - inside.start, []
+    trials = max(1, round(count * (1 + floor) / (float(areas.mean()) * (MEAN_COSINE + floor) * n)))
+    seeds = rng.integers(1 << 63, size=n, dtype=np.uint64)
+    for a in range(0, n, BLOCK):
+        block = slice(a, min(a + BLOCK, n))
+        found = _kept(normals[inside][block], directions, areas, floor, trials, seeds[block])
+        vertex, trial = np.nonzero(found >= 0)
+        parts.append((inside.start + a + vertex, found[vertex, trial].astype(np.int64)))
+    vertices, texels = (np.concatenate(column) for column in zip(*parts, strict=True))
+    cosine = np.einsum("md,md->m", normals[vertices], directions[texels]).astype(np.float64)
+    probability = areas[texels] * (np.maximum(cosine, 0) + floor) / (1 + floor)
+    return Chosen(vertices, texels, lighting.n_directions / (trials * np.maximum(probability, 1e-12)))
+
+
+@numba.njit(parallel=True, cache=True)
+def _kept(
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    areas: NDArray[np.float32],
+    floor: float,
+    trials: int,
+    seeds: NDArray[np.uint64],
+) -> NDArray[np.int32]:
+    """Texel of each trial of each vertex, (n, trials), -1 where it is rejected."""
+    found = np.full((len(normals), trials), -1, np.int32)
+    for i in numba.prange(len(normals)):
+        state = seeds[i]
+        for k in range(trials):
+            state += np.uint64(0x9E3779B97F4A7C15)
+            bits = _mixed(state)
+            texel = int(((bits >> np.uint64(32)) * np.uint64(len(directions))) >> np.uint64(32))
+            uniform = (bits & np.uint64(0xFFFFFFFF)) / 2.0**32
+            cosine = 0.0
+            for d in range(3):
+                cosine += normals[i, d] * directions[texel, d]
+            if uniform * (1 + floor) < areas[texel] * (max(cosine, 0.0) + floor):
+                found[i, k] = texel
+    return found
+
+
+@numba.njit
+def _mixed(x: np.uint64) -> np.uint64:
+    """The finaliser of SplitMix64, as in ``hashing``."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@numba.njit(parallel=True, cache=True)
+def _near_edges(
+    bits: Bits,
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    around: NDArray[np.int32],
+    vertices: NDArray[np.int64],
+    texels: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether a bit differs from one of those around it, (m,); below the horizon there is nothing to differ from."""
+    near = np.zeros(len(vertices), np.bool_)
+    for e in numba.prange(len(vertices)):
+        i = vertices[e]
+        own = _bit(bits[i], texels[e])
+        for j in around[texels[e]]:
+            if _bit(bits[i], j) != own:
+                cosine = 0.0
+                for d in range(3):
+                    cosine += normals[i, d] * directions[j, d]
+                if cosine > 0:
+                    near[e] = True
+                    break
+    return near
+
+
+@numba.njit
+def _bit(words: Bits, texel: int) -> int:
+    return (words[texel // BITS] >> np.uint32(texel % BITS)) & np.uint32(1)
