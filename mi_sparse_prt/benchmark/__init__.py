@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.direct import measure_direct
-from mi_sparse_prt.benchmark.machine import describe_machine
+from mi_sparse_prt.benchmark.machine import report_header
 from mi_sparse_prt.benchmark.paths import measure_paths
 from mi_sparse_prt.benchmark.relight import measure_relighting
 from mi_sparse_prt.emission.cubemap import CubemapLighting
@@ -53,14 +52,7 @@ def run_benchmark(
         relight = measure_relighting(scene, lighting, bits, repeats)
         bar.update()
     return {
-        "machine": describe_machine(),
-        "scene": {
-            "path": scene.path,
-            "hash": scene.hash,
-            "vertices": len(scene.positions),
-            "triangles": int(np.sum([len(mesh.triangles) for mesh in scene.meshes])),
-            "directions": lighting.n_directions,
-        },
+        **report_header(scene, lighting),
         "repeats": repeats,
         "direct": direct,
         "paths": paths,

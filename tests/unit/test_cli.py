@@ -129,6 +129,17 @@ def test_precompute_prints_what_was_done_and_skipped(folder, matrix):
         assert part in text
 
 
+@pytest.mark.parametrize("method", ["sparse", "huang2010"])
+def test_methods_are_precomputed_with_a_forecast(folder, scene, method):
+    result = call(
+        "precompute", scene, "-o", folder / f"{method}.prt", "--method", method, "--resolution", 4, "--spp", 2
+    )
+    assert result.exit_code == 0, result.stderr
+    report = prt.load_transport(folder / f"{method}.prt").report
+    assert report["parameters"]["method"] == method
+    assert report["forecast"]["seconds"] > 0
+
+
 def test_quiet_says_nothing(folder, scene):
     result = call("precompute", scene, "-o", folder / "quiet.prt", "--quiet", "--max-depth", 2, *PRECOMPUTE)
     assert (result.exit_code, result.stdout, result.stderr) == (0, "", "")
