@@ -26,7 +26,8 @@ class Dense:
     Attributes
     ----------
     ids : (n_dense,) int64
-        Vertices of the scene, in the order of ``rows``.
+        Vertices of the scene, in the order of ``rows``: mesh by mesh, and there by key, so that sums over rows round
+        alike in whatever order vertices come.
     rows : DenseRows
     ranks : (n_v,) float32
         Local rank of every vertex ([HR10] 4.1); 0 where it was not asked for.
@@ -39,9 +40,10 @@ class Dense:
     ranks: NDArray[np.float32]
     iterations: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
 
-    def of_mesh(self, mesh: Mesh) -> NDArray[np.int64]:
-        """Indices into ``ids`` of the dense vertices of a mesh."""
-        return np.flatnonzero((self.ids >= mesh.vertices.start) & (self.ids < mesh.vertices.stop))
+    def of_mesh(self, mesh: Mesh) -> slice:
+        """Where in ``ids`` the dense vertices of a mesh are."""
+        before, until = (int((self.ids < end).sum()) for end in (mesh.vertices.start, mesh.vertices.stop))
+        return slice(before, until)
 
 
 class DenseSampler:
@@ -96,11 +98,14 @@ class DenseSampler:
 
     def dense(self) -> Dense:
         """All that was taken so far."""
+        ids = np.concatenate(self._ids)
+        mesh = np.searchsorted([m.vertices.stop for m in self.scene.meshes], ids, side="right")
+        order = np.lexsort((self.direct.points.keys[ids], mesh))
         joined = [
-            np.concatenate([getattr(rows, name) for rows in self._rows])
+            np.concatenate([getattr(rows, name) for rows in self._rows])[order]
             for name in ("visible", "evaluated", "features", "above")
         ]
-        return Dense(np.concatenate(self._ids), DenseRows(*joined), self._ranks, self._iterations)
+        return Dense(ids[order], DenseRows(*joined), self._ranks, self._iterations)
 
     def _traced(self, ids: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
         with self.clock.phase("dense_rays"):

@@ -264,13 +264,13 @@ def _rates(
     n_directions: int,
 ) -> dict[str, float]:
     """Sampling rates of a mesh, as in Figure 9."""
-    own = dense.of_mesh(mesh)
+    own = per_dense[dense.of_mesh(mesh)]
     others = (sparse >= mesh.vertices.start) & (sparse < mesh.vertices.stop)
     n = len(own) + int(others.sum())
-    total = per_dense[own].sum() + evaluated[others].sum()
+    total = own.sum() + evaluated[others].sum()
     return {
         "dense_vertices": len(own) / n,
-        "dense_directions": float(per_dense[own].mean()) / n_directions,
+        "dense_directions": float(own.mean()) / n_directions,
         "sparse_directions": float(evaluated[others].mean()) / n_directions if others.any() else 0.0,
         "elements": float(total) / (n * n_directions),
     }

@@ -110,8 +110,6 @@ def _dense_rows(
     noise, files = np.empty(len(dense.ids)), []
     for number, (group, prior) in enumerate(zip(groups, priors, strict=True)):
         chosen = dense.of_mesh(group.mesh)
-        # by key: sums over rows then round alike in whatever order vertices come
-        chosen = chosen[np.argsort(solver.points.keys[dense.ids[chosen]], kind="stable")]
         # other vertices would be dense for another fraction
         path = checkpoint and checkpoint.with_suffix(f".{number}.{len(dense.ids)}{checkpoint.suffix}")
         with clock.phase("dense_paths"):
@@ -121,33 +119,32 @@ def _dense_rows(
         files += [kept] if kept else []
         with clock.phase("low_rank"):
             noise[chosen] = rows.variance.mean(axis=(1, 2))
-            smoothing = _smoothing(dense, chosen, dense.ids[chosen] - group.mesh.vertices.start, *prior)
+            smoothing = _smoothing(dense.ids[chosen] - group.mesh.vertices.start, chosen.start, *prior)
             for c in range(solver.channels):
                 mean, variance = rows.mean[..., c], rows.variance[..., c]
-                density[chosen, :, c] = _with_sums_of(mean, smoothed(denoised(mean, variance), smoothing))
+                factors = _with_sums_of(mean, smoothed(denoised(mean, variance), smoothing))
+                np.matmul(*factors, out=density[chosen, :, c])
     return density, noise, files
 
 
 def _smoothing(
-    dense: Dense,
-    chosen: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    near: Neighbours,
-    prior: NDArray[np.float32],
+    rows: NDArray[np.int64], first: int, near: Neighbours, prior: NDArray[np.float32]
 ) -> scipy.sparse.csr_array:
-    """Weights (n, n) among the chosen dense vertices of a mesh: those by which other vertices are interpolated."""
-    place = np.empty(len(dense.ids), np.int32)
-    place[chosen] = np.arange(len(chosen))
+    """Weights (n, n) among the dense vertices of a mesh: those by which other vertices are interpolated.
+
+    They are these rows of the mesh's neighbours, and the first one is ``first`` among all dense vertices.
+    """
     ids, weights = near.ids[rows], prior[rows]
     present = ids >= 0
     starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    return scipy.sparse.csr_array(
-        (weights[present], place[ids[present]], starts), shape=(len(rows), len(rows))
-    )
+    entries = weights[present], ids[present] - first, starts
+    return scipy.sparse.csr_array(entries, shape=(len(rows), len(rows)))
 
 
-def _with_sums_of(rows: NDArray[np.float32], low_rank: LowRank) -> NDArray[np.float32]:
-    """The matrix of low rank, and what its sums of rows and columns lack, in the proportions of columns and rows.
+def _with_sums_of(
+    rows: NDArray[np.float32], low_rank: LowRank
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Factors of the matrix of low rank, and of what its sums lack, in the proportions of columns and rows.
 
     Shrinkage minimizes the error of elements, and takes light away. Sums hold little noise: a mesh gets what it should
     from every direction, a vertex what it should under even light.
@@ -156,11 +153,12 @@ def _with_sums_of(rows: NDArray[np.float32], low_rank: LowRank) -> NDArray[np.fl
     by_column, by_row = left.sum(axis=0) @ right, left @ right.sum(axis=1)
     total = float(by_row.sum())
     if total <= 0:
-        return low_rank.matrix()
+        return left, right
     of_rows, of_columns = rows.sum(axis=1) - by_row, rows.sum(axis=0) - by_column
     of_columns -= of_rows.sum() / total * by_column  # what the rows get is shared out among columns
-    return np.hstack([left, of_rows[:, None], by_row[:, None]]) @ np.vstack(
-        [right, by_column / total, of_columns / total]
+    return (
+        np.hstack([left, of_rows[:, None], by_row[:, None]]),
+        np.vstack([right, by_column / total, of_columns / total]),
     )
 
 
@@ -214,16 +212,17 @@ class _Fit:
         weights, start = prior.copy(), group.mesh.vertices.start
         order = np.argsort(mix(self._solver.points.keys[group.sparse]), kind="stable")
         pilot = np.sort(group.sparse[order[:PILOT]])
-        halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start])
+        halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start], 2)
         with self._clock.phase("solver"):
-            deviation = best_deviation(halves, noise)
+            deviation = best_deviation((halves[0], halves[1]), noise)
         if deviation == 0:
             return weights
         for ids in self._batches(group, pilot, progress):
             if ids is not pilot:
-                halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start])
+                halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start], 1)
             with self._clock.phase("solver"):
-                weights[ids - start] += correction(halves[0] + halves[1], noise, deviation).astype(np.float32)
+                system = sum(halves[1:], halves[0])
+                weights[ids - start] += correction(system, noise, deviation).astype(np.float32)
         return weights
 
     @staticmethod
@@ -237,9 +236,9 @@ class _Fit:
             yield others[a : a + BLOCK]
 
     def _sampled(
-        self, ids: NDArray[np.int64], near: NDArray[np.int32], prior: NDArray[np.float32]
-    ) -> tuple[tuple[System, System], NDArray[np.float64]]:
-        """Systems of the even and the odd samples of some vertices, and the noise of one sample of each, (n,)."""
+        self, ids: NDArray[np.int64], near: NDArray[np.int32], prior: NDArray[np.float32], parts: int
+    ) -> tuple[list[System], NDArray[np.float64]]:
+        """Systems of every so many samples of some vertices, and the noise of one sample of each, (n,)."""
         with self._clock.phase("system"):
             rows, texels = listed(self._evaluated[ids] & pack(self._place >= 0))
         with self._clock.phase("sparse_paths"):
@@ -255,8 +254,10 @@ class _Fit:
             present = near >= 0
             noise = (self._noise[near] * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
             noise = np.maximum(noise, LEAST_NOISE * self._noise.mean())
-            halves = [self._system(directions[:, k::2], values[:, :, k::2], near, prior) for k in (0, 1)]
-        return (halves[0], halves[1]), noise
+            return [
+                self._system(directions[:, k::parts], values[:, :, k::parts], near, prior)
+                for k in range(parts)
+            ], noise
 
     def _system(
         self,

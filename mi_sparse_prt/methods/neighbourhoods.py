@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,16 @@ def neighbourhoods(
     if not len(lonely):
         return dense, groups
     sampler.add(lonely)
-    dense = sampler.dense()
+    more = sampler.dense()
     with clock.phase("neighbours"):
-        return dense, [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
+        for number, (group, found) in enumerate(zip(groups, few, strict=True)):
+            if len(found):
+                groups[number] = _neighbourhood(scene, more, group.mesh)
+            else:
+                shift = more.of_mesh(group.mesh).start - dense.of_mesh(group.mesh).start
+                ids = np.where(group.near.ids >= 0, group.near.ids + np.int32(shift), -1)
+                groups[number] = replace(group, near=replace(group.near, ids=ids))
+    return more, groups
 
 
 def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> Neighbourhood:
@@ -61,5 +68,5 @@ def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> Neighbourhood:
     sparse = np.setdiff1d(np.arange(inside.start, inside.stop), own)
     p, n = scene.normalised_positions, scene.normals
     near = surface_neighbours(p[inside], n[inside], p[own], n[own], NEIGHBOURS)
-    ids = np.where(near.ids >= 0, chosen[near.ids], -1).astype(np.int32)
+    ids = np.where(near.ids >= 0, near.ids + np.int32(chosen.start), -1)
     return Neighbourhood(mesh, sparse, Neighbours(ids, near.distances))

@@ -23,7 +23,7 @@ from mi_sparse_prt.methods.neighbourhoods import Neighbourhood, neighbourhoods
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.bits import Bits, above_horizon, counts, listed, overwrite, pack
-from mi_sparse_prt.sampling.features import contested
+from mi_sparse_prt.sampling.features import contested, copy_agreed
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
@@ -33,6 +33,7 @@ STEP = DENSE / 4  # of them in an iteration
 POWER = 1.5  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
+BLOCK = 1 << 14  # sparse vertices at a time, some hundred rays each
 
 
 def sparse_parts(
@@ -73,11 +74,11 @@ def sparse_parts(
 
     state = _Visibility(direct, dense, clock)
     for group in groups:
-        unknown = state.agree(group)
+        state.agree(group)
         with clock.phase("repair"):
             near = group.around_sparse(scene)
         for _ in range(ROUNDS):
-            state.repair(group, near, unknown)
+            state.repair(group, near)
 
     part, paths = None, 0
     if indirect is not None:
@@ -104,21 +105,14 @@ class _Visibility:
             self.visible[dense.ids] = dense.rows.visible
             self.evaluated[dense.ids] = dense.rows.evaluated
 
-    def agree(self, group: Neighbourhood) -> Bits:
-        """Rows of sparse vertices: what their neighbours agree on, and traced rays elsewhere.
-
-        Returns the directions above the horizon in which no ray was traced, (n_sparse, words).
-        """
-        rows = self._dense.rows
+    def agree(self, group: Neighbourhood) -> None:
+        """Rows of sparse vertices: what their dense neighbours agree on, and traced rays elsewhere."""
+        near, rows, sparse = group.near_sparse, self._dense.rows, group.sparse
         with self._clock.phase("consensus"):
-            unknown = self.above[group.sparse]
-            differ, agreed = contested(group.near_sparse, rows.visible, rows.above, unknown)
-            self.visible[group.sparse] = agreed
-            self._trace(group.sparse, differ)
-            unknown ^= differ
-        return unknown
+            copy_agreed(near, rows.visible, rows.above, sparse, self.above, self.visible)
+            self._trace(sparse, contested(near, rows.visible, rows.above, sparse, self.above, self.evaluated))
 
-    def repair(self, group: Neighbourhood, near: NDArray[np.int32], unknown: Bits) -> None:
+    def repair(self, group: Neighbourhood, near: NDArray[np.int32]) -> None:
         """Trace where the nearest of all vertices differ: they are nearer than the dense ones, and know more by now.
 
         Parameters
@@ -126,21 +120,21 @@ class _Visibility:
         group : Neighbourhood
         near : (n_sparse, k) int32
             Vertices of the mesh, counted from its first.
-        unknown : (n_sparse, words) uint32 bits
-            Directions in which no ray was traced; those that are now are taken out.
         """
-        inside = group.mesh.vertices
+        visible, above = (bits[group.mesh.vertices] for bits in (self.visible, self.above))
         with self._clock.phase("repair"):
-            differ, _ = contested(near, self.visible[inside], self.above[inside], unknown)
-            self._trace(group.sparse, differ)
-            unknown ^= differ
+            self._trace(
+                group.sparse, contested(near, visible, above, group.sparse, self.above, self.evaluated)
+            )
 
     def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> None:
-        """Evaluate and keep elements (n, words)."""
-        ids, texels = listed(asked)
-        with self._clock.phase("sparse_rays"):
-            values = self._direct.visible(vertices.astype(np.uint32)[ids], texels)
-        overwrite(self.visible, self.evaluated, vertices, asked, values)
+        """Evaluate and keep elements (n, words), some vertices at a time: lists are long."""
+        for a in range(0, len(vertices), BLOCK):
+            some, bits = vertices[a : a + BLOCK], asked[a : a + BLOCK]
+            rows, texels = listed(bits)
+            with self._clock.phase("sparse_rays"):
+                values = self._direct.visible(some.astype(np.uint32)[rows], texels)
+            overwrite(self.visible, self.evaluated, some, bits, values)
 
 
 def _account(
@@ -170,7 +164,8 @@ def _account(
     n_directions = direct.lighting.n_directions
     parts.sampling = {
         mesh.name: {
-            "dense_vertices": len(dense.of_mesh(mesh)) / (mesh.vertices.stop - mesh.vertices.start),
+            "dense_vertices": len(dense.ids[dense.of_mesh(mesh)])
+            / (mesh.vertices.stop - mesh.vertices.start),
             "dense_directions": float(either[dense.ids[dense.of_mesh(mesh)]].mean()) / n_directions,
             "sparse_directions": _mean_outside(either, dense.ids, mesh) / n_directions,
             "elements": float(either[mesh.vertices].mean()) / n_directions,

@@ -172,7 +172,7 @@ def _above(gram: NDArray[np.float32], least: float) -> tuple[NDArray[np.float32]
     """
     basis = np.random.default_rng(0).standard_normal((len(gram), SKETCH), np.float32)
     for _ in range(PASSES):
-        basis = np.linalg.qr(gram @ basis)[0]
+        basis = _orthonormal(gram @ basis)
     squares, turned = np.linalg.eigh(basis.T @ (gram @ basis))
     if (squares > least).sum() <= 0.8 * SKETCH:
         return squares[squares > least], basis @ turned[:, squares > least]
@@ -180,3 +180,16 @@ def _above(gram: NDArray[np.float32], least: float) -> tuple[NDArray[np.float32]
         gram, subset_by_value=(least, np.inf), driver="evx", overwrite_a=True, check_finite=False
     )
     return values, vectors
+
+
+def _orthonormal(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The columns (m, b) made orthonormal, by Cholesky factors of their products: a sixth of the time of a QR.
+
+    They square the condition, for which float64 has room unless a column is hardly more than rounding.
+    """
+    wide = vectors.astype(np.float64)
+    try:
+        lower = np.linalg.cholesky(wide.T @ wide)
+    except np.linalg.LinAlgError:
+        return np.linalg.qr(vectors)[0]
+    return scipy.linalg.solve_triangular(lower, wide.T, lower=True, check_finite=False).T.astype(np.float32)

@@ -52,15 +52,15 @@ def _gathered(
     directions: NDArray[np.int32],
     values: NDArray[np.float32],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A (s, k) and y (s,) of one vertex; zeros where it has fewer directions or neighbours."""
-    system = np.zeros((len(directions), len(neighbours)))
-    y = np.zeros(len(directions))
-    for q in range(len(directions)):
-        j = directions[q]
-        if j < 0:
-            continue
-        y[q] = values[q]
-        for k in range(len(neighbours)):
-            if neighbours[k] >= 0:
-                system[q, k] = rows[neighbours[k], j]
+    """A (m, k) and y (m,) of the m directions that one vertex has; zeros where it has fewer neighbours."""
+    taken = np.flatnonzero(directions >= 0)
+    system = np.zeros((len(taken), len(neighbours)))
+    y = np.empty(len(taken))
+    for q in range(len(taken)):
+        y[q] = values[taken[q]]
+    for k in range(len(neighbours)):
+        if neighbours[k] >= 0:
+            row = rows[neighbours[k]]
+            for q in range(len(taken)):
+                system[q, k] = row[directions[taken[q]]]
     return system, y

@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 from mi_sparse_prt.sampling.bits import Bits
 
 
-def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, asked: Bits) -> tuple[Bits, Bits]:
-    """Directions in which a vertex's neighbours differ or know nothing, and what they agree on elsewhere.
+def contested(
+    neighbours: NDArray[np.int32],
+    visible: Bits,
+    known: Bits,
+    vertices: NDArray[np.int64],
+    above: Bits,
+    evaluated: Bits,
+) -> Bits:
+    """Directions in which a vertex's neighbours differ or know nothing: those to sample.
 
     The limit of [HR10] 5.2 for binary visibility: the variance among the neighbours is not zero. All such directions
     are taken, be they more or fewer than the paper's 350.
@@ -21,37 +28,71 @@ def contested(neighbours: NDArray[np.int32], visible: Bits, known: Bits, asked: 
         Rows of ``visible`` and ``known``; -1 where there are fewer.
     visible, known : (m, words) uint32 bits
         Visibility of the neighbours, and the directions in which it is known (above their horizon).
-    asked : (n, words) uint32 bits
-        Directions that matter: above the vertices' own horizon.
+    vertices : (n,) int
+        Rows of ``above`` and ``evaluated``: whose neighbours these are.
+    above, evaluated : (n_v, words) uint32 bits
+        Directions above the horizon, and those that were sampled before.
 
     Returns
     -------
-    differ, agreed : (n, words) uint32 bits
-        Of those asked for, directions to sample; and those in which all that know see the sky.
+    (n, words) uint32 bits
+        Above the vertex's own horizon, and not sampled before.
     """
-    differ, agreed = np.empty_like(asked), np.empty_like(asked)
-    _contested(neighbours, visible, known, asked, differ, agreed)
-    return differ, agreed
+    differ = np.empty((len(vertices), above.shape[1]), np.uint32)
+    _contested(neighbours, visible, known, vertices, above, evaluated, differ)
+    return differ
 
 
 @numba.njit(parallel=True, cache=True)
 def _contested(
-    neighbours: NDArray[np.int32], visible: Bits, known: Bits, asked: Bits, differ: Bits, agreed: Bits
+    neighbours: NDArray[np.int32],
+    visible: Bits,
+    known: Bits,
+    vertices: NDArray[np.int64],
+    above: Bits,
+    evaluated: Bits,
+    differ: Bits,
 ) -> None:
-    words = asked.shape[1]
-    for i in numba.prange(len(asked)):
-        lit, dark = np.zeros(words, np.uint32), np.zeros(words, np.uint32)
-        for k in range(neighbours.shape[1]):
-            row = neighbours[i, k]
-            if row < 0:
-                break
-            seen, knows = visible[row], known[row]
-            for w in range(words):
-                lit[w] |= seen[w]
-                dark[w] |= knows[w] & ~seen[w]
+    for i in numba.prange(len(vertices)):
+        lit, dark = _kinds(neighbours[i], visible, known)
+        row = vertices[i]
+        for w in range(above.shape[1]):
+            differ[i, w] = above[row, w] & ~evaluated[row, w] & ~(lit[w] ^ dark[w])
+
+
+@numba.njit(parallel=True, cache=True)
+def copy_agreed(
+    neighbours: NDArray[np.int32],
+    visible: Bits,
+    known: Bits,
+    vertices: NDArray[np.int64],
+    above: Bits,
+    result: Bits,
+) -> None:
+    """Give vertices the visibility on which their neighbours agree; parameters as for ``contested``.
+
+    ``result`` (n_v, words): rows of the vertices are overwritten, with 0 where neighbours differ or know nothing.
+    """
+    for i in numba.prange(len(vertices)):
+        lit, dark = _kinds(neighbours[i], visible, known)
+        row = vertices[i]
+        for w in range(above.shape[1]):
+            result[row, w] = above[row, w] & lit[w] & ~dark[w]
+
+
+@numba.njit(cache=True)
+def _kinds(neighbours: NDArray[np.int32], visible: Bits, known: Bits) -> tuple[Bits, Bits]:
+    """Directions in which any of the neighbours sees the sky, and in which any does not, (words,) each."""
+    words = visible.shape[1]
+    lit, dark = np.zeros(words, np.uint32), np.zeros(words, np.uint32)
+    for row in neighbours:
+        if row < 0:
+            break
+        seen, knows = visible[row], known[row]
         for w in range(words):
-            differ[i, w] = asked[i, w] & ~(lit[w] ^ dark[w])
-            agreed[i, w] = asked[i, w] & lit[w] & ~dark[w]
+            lit[w] |= seen[w]
+            dark[w] |= knows[w] & ~seen[w]
+    return lit, dark
 
 
 @numba.njit(parallel=True, cache=True)

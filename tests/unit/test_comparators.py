@@ -175,8 +175,10 @@ def test_features_of_exact_rows_are_those_that_rays_find(
     direct = DirectTransport(scene.normalised, lighting, vertex_points(scene))
     sampler = DenseSampler(scene, direct, AngularGrid(lighting), Stopwatch())
     sampler.add(ids + inside.start)
-    found = _surface(scene, lighting, "ball").features(ids)
-    assert found.any() and np.array_equal(found, sampler.dense().rows.features)
+    dense = sampler.dense()
+    assert np.array_equal(np.sort(dense.ids), ids + inside.start)
+    found = _surface(scene, lighting, "ball").features(dense.ids - inside.start)
+    assert found.any() and np.array_equal(found, dense.rows.features)
 
 
 # -- choices ---------------------------------------------------------------------------------------------------------

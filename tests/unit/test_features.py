@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mi_sparse_prt.sampling.bits import pack, unpack
-from mi_sparse_prt.sampling.features import best_features, contested
+from mi_sparse_prt.sampling.bits import Bits, pack, unpack
+from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
 
 M = 40  # directions: a word and part of a second
 
@@ -26,6 +26,13 @@ def some_neighbours(n: int, n_dense: int, rng: np.random.Generator) -> NDArray[n
 # ------------------------------------------------------------------------------------ contested
 
 
+def judged(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: Bits) -> tuple[Bits, Bits]:
+    """What is contested, and what is agreed on, of vertices of which nothing was sampled."""
+    vertices, agreed = np.arange(len(above)), np.full_like(above, 0xABCDEF)
+    copy_agreed(neighbours, visible, known, vertices, above, agreed)
+    return contested(neighbours, visible, known, vertices, above, np.zeros_like(above)), agreed
+
+
 @given(st.integers(0, 6), st.integers(1, 8), st.sampled_from([1, 31, 32, 33, 96]), st.integers(0, 10**6))
 @settings(deadline=None)
 def test_contested_against_loops(n, n_dense, m, seed):
@@ -34,7 +41,7 @@ def test_contested_against_loops(n, n_dense, m, seed):
     known = rng.random((n_dense, m)) < rng.random()
     visible = known & (rng.random((n_dense, m)) < rng.random())
     above = rng.random((n, m)) < 0.7
-    differ, agreed = contested(neighbours, pack(visible), pack(known), pack(above))
+    differ, agreed = judged(neighbours, pack(visible), pack(known), pack(above))
     assert differ.shape == agreed.shape == (n, -(-m // 32))
     for i in range(n):
         for j in range(32 * differ.shape[1]):
@@ -51,9 +58,7 @@ def test_where_all_agree_nothing_is_traced():
     rng = np.random.default_rng(0)
     row, above = rng.random(M) < 0.5, rng.random((1, M)) < 0.5
     everywhere = np.ones((4, M), bool)
-    differ, agreed = contested(
-        near([[0, 1, 2, 3]]), pack(np.tile(row, (4, 1))), pack(everywhere), pack(above)
-    )
+    differ, agreed = judged(near([[0, 1, 2, 3]]), pack(np.tile(row, (4, 1))), pack(everywhere), pack(above))
     assert not differ.any()
     assert np.array_equal(unpack(agreed, M), above & row)
 
@@ -62,7 +67,7 @@ def test_what_is_below_every_neighbours_horizon_is_traced():
     """The vertex sees further around than any neighbour: nobody can tell."""
     known, above = np.zeros((2, M), bool), np.ones((1, M), bool)
     known[0, :10], known[1, 5:20] = True, True
-    differ, agreed = contested(near([[0, 1]]), pack(known), pack(known), pack(above))
+    differ, agreed = judged(near([[0, 1]]), pack(known), pack(known), pack(above))
     assert np.array_equal(np.flatnonzero(unpack(differ, M)), np.arange(20, M))
     assert np.array_equal(np.flatnonzero(unpack(agreed, M)), np.arange(20))
 
@@ -71,7 +76,7 @@ def test_ignorance_is_no_vote():
     """A neighbour below whose horizon a direction is does not say that it is dark."""
     known = np.zeros((2, M), bool)
     known[0] = True
-    differ, agreed = contested(near([[0, 1]]), pack(known), pack(known), pack(np.ones((1, M), bool)))
+    differ, agreed = judged(near([[0, 1]]), pack(known), pack(known), pack(np.ones((1, M), bool)))
     assert not differ.any()
     assert unpack(agreed, M).all()
 
@@ -80,7 +85,7 @@ def test_one_dissenter_is_enough():
     visible = np.ones((40, M), bool)
     visible[17, 33] = False
     everywhere = np.ones((40, M), bool)
-    differ, agreed = contested(near([list(range(40))]), pack(visible), pack(everywhere), pack(everywhere[:1]))
+    differ, agreed = judged(near([list(range(40))]), pack(visible), pack(everywhere), pack(everywhere[:1]))
     assert np.flatnonzero(unpack(differ, M)).tolist() == [33]
     assert unpack(agreed, M).sum() == M - 1
 
@@ -88,9 +93,23 @@ def test_one_dissenter_is_enough():
 def test_without_neighbours_all_is_traced():
     above = np.random.default_rng(1).random((3, M)) < 0.5
     nobody = np.full((3, 2), -1, np.int32)
-    differ, agreed = contested(nobody, pack(above), pack(above), pack(above))
+    differ, agreed = judged(nobody, pack(above), pack(above), pack(above))
     assert np.array_equal(differ, pack(above))
     assert not agreed.any()
+
+
+def test_nothing_is_sampled_twice_and_other_rows_are_left_alone():
+    """Vertices 4 and 1 of six, with neighbours that know nothing: all above that was not sampled before."""
+    rng = np.random.default_rng(2)
+    above, before = rng.random((6, M)) < 0.5, rng.random((6, M)) < 0.3
+    nobody, vertices = np.full((2, 3), -1, np.int32), np.array([4, 1])
+    nothing = pack(np.zeros((1, M), bool))
+    differ = contested(nobody, nothing, nothing, vertices, pack(above), pack(before))
+    assert np.array_equal(unpack(differ, M), (above & ~before)[vertices])
+    result = pack(before)
+    copy_agreed(nobody, nothing, nothing, vertices, pack(above), result)
+    assert not result[vertices].any()
+    assert np.array_equal(unpack(result, M)[[0, 2, 3, 5]], before[[0, 2, 3, 5]])
 
 
 # ------------------------------------------------------------------------------------ best features

@@ -18,7 +18,7 @@ from mi_sparse_prt.reconstruction.low_rank import denoised
 from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.bits import pack, unpack
-from mi_sparse_prt.sampling.features import best_features, contested
+from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
 from mi_sparse_prt.sampling.spatial import local_rank
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.path import PathTransport
@@ -195,7 +195,9 @@ def test_rows_that_are_all_equal_are_not_contested(value):
     """All dark (inside of another object) or all lit: neighbours agree, and a matrix of them has rank 0 or 1."""
     seen, everywhere = np.full((5, WIDTH), value), np.ones((5, WIDTH), bool)
     near = np.tile(np.arange(5, dtype=np.int32), (3, 1))
-    differ, agreed = contested(near, pack(seen), pack(everywhere), pack(everywhere[:3]))
+    dense, own, agreed = pack(everywhere), pack(everywhere[:3]), pack(~everywhere[:3])
+    differ = contested(near, pack(seen), dense, np.arange(3), own, np.zeros_like(own))
+    copy_agreed(near, pack(seen), dense, np.arange(3), own, agreed)
     assert not differ.any()
     assert (unpack(agreed, WIDTH) == value).all()
     assert local_rank(pack(seen), near).tolist() == [int(value)] * 3
