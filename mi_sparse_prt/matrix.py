@@ -237,6 +237,45 @@ class Interpolated:
         return replace(self, weights=self.weights[source])
 
 
+@dataclass(frozen=True)
+class Factored:
+    """Interreflected light as a product of two thin matrices per channel: it has a low rank.
+
+    Attributes
+    ----------
+    left : tuple of (n_v, rank) float32
+        One per channel: 1 in a grey scene, else 3. Ranks may differ.
+    right : tuple of (rank, n_directions) float32
+    """
+
+    left: tuple[NDArray[np.float32], ...]
+    right: tuple[NDArray[np.float32], ...]
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        """Of each channel."""
+        return tuple(len(right) for right in self.right)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(factor.nbytes for factor in (*self.left, *self.right))
+
+    def rows(self, ids: Rows) -> NDArray[np.float32]:
+        return np.stack([a[ids] @ b for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+
+    def columns(self, ids: Rows) -> NDArray[np.float32]:
+        return np.stack([a @ b[:, ids] for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+
+    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+        if len(self.left) == 1:
+            return self.left[0] @ (self.right[0] @ lighting)
+        channels = zip(self.left, self.right, lighting.T, strict=True)
+        return np.stack([a @ (b @ light) for a, b, light in channels], axis=-1)
+
+    def reordered(self, source: Rows) -> Factored:
+        return replace(self, left=tuple(left[source] for left in self.left))
+
+
 def _in_blocks(matrix: NDArray[Any], vectors: NDArray[np.float32], block: int = 4096) -> NDArray[np.float32]:
     """A product with a matrix of small numbers, converted to float32 one block of rows at a time."""
     product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
@@ -276,7 +315,7 @@ class LightTransport:
     basis: str
     albedo: NDArray[np.float32]
     direct: Visibility | MeanCosine | Interpolated
-    indirect: Indirect | Interpolated | None
+    indirect: Indirect | Interpolated | Factored | None
     meshes: tuple[MeshRange, ...]
     vertex_keys: NDArray[np.uint64]
     scene_hash: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,10 +29,13 @@ from mi_sparse_prt.planner import IndirectPlan, indirect_solver, plan_indirect
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.gather import GatherTransport
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.held_out import held_out_error
 
 _DENSE_FRACTIONS = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the vertices, tried in turn for a target error
+_GATHER = (256, 0.03)  # rays per vertex, and what a low rank may cost of the first bounce
+_FINER_GATHER = ((64, 0.06), (256, 0.03), (1024, 0.015), (4096, 0.008))  # tried in turn for a target error
 _JUDGES = 1 << 20  # seeds of held-out elements that decide
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 _PILOT_SHARE = 8  # a forecast traces this fraction of one wavefront
@@ -51,6 +54,7 @@ _SHARES = {
     "brute_force": _Share(1, 1, 1, 1),
     "sparse": _Share(0.8, 0.08, 1, 0.06),
     "huang2010": _Share(2.7, 0.12, 0.22, 0.07),
+    "gather": _Share(3, 0, 1, 0.05),
 }
 
 
@@ -76,8 +80,9 @@ def precompute(
     scene : Scene
     lighting : CubemapLighting
         The emission space: one column per texel.
-    method : {"brute_force", "sparse", "huang2010"}
-        Evaluate every element; few of them (``methods.sparse``); or few as [HR10] does (``methods.huang2010``).
+    method : {"brute_force", "sparse", "huang2010", "gather"}
+        Evaluate every element; few of them (``methods.sparse``); few as [HR10] does (``methods.huang2010``); or all
+        direct ones, and interreflections by finite elements (``transport.gather``, diffuse scenes only).
     basis : {"direction", "texel"}
         Whether a texel's light arrives from its centre alone or from its whole area.
     max_depth : int
@@ -87,8 +92,9 @@ def precompute(
     target_error : float, optional
         Relative L2 error of the whole matrix to aim at. For brute force, a pilot on a few vertices then chooses the
         cheapest ``indirect_resolution`` and ``spp`` (see ``planner``), in place of those given. ``"sparse"`` starts
-        with 5% of the vertices dense and doubles them until held-out elements meet it; the report counts all that was
-        evaluated on the way. A warning says if the held-out error shows that the target was missed.
+        with 5% of the vertices dense and doubles them until held-out elements meet it, ``"gather"`` with 64 rays per
+        vertex, then four times as many; the report counts all that was evaluated on the way. A warning says if the
+        held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices.
     progress : bool
@@ -128,7 +134,7 @@ def precompute(
     indirect, skipped = _indirect_if_any(scene, settings, clock)
     forecast = _forecast(direct, indirect, settings.method, clock, progress)
     checkpoint = _checkpoint_path(checkpoint_folder, scene, points, settings)
-    compute = _brute_force if settings.method == "brute_force" else _sparse
+    compute = {"brute_force": _brute_force, "gather": _gather}.get(settings.method, _sparse)
     parts = compute(direct, indirect, scene, settings, clock, progress, checkpoint)
     transport = _matrix(scene, points, lighting, basis, parts)
     with clock.phase("held_out"):
@@ -168,19 +174,71 @@ def _sparse(
     progress: bool,
     checkpoint: Path | None,
 ) -> Parts:
-    """Evaluate few elements: with a target error, twice as many dense vertices each time until it is met.
+    """Evaluate few elements: with a target error, twice as many dense vertices each time until it is met."""
+    if settings.method == "huang2010":
+        return huang2010_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint)
+
+    def attempt(fraction: float | None) -> Parts:
+        return sparse_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint, fraction)
+
+    return _refined(attempt, _DENSE_FRACTIONS, direct, scene, settings, clock)
+
+
+def _gather(
+    direct: DirectTransport,
+    indirect: PathTransport | None,
+    scene: Scene,
+    settings: Settings,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None,
+) -> Parts:
+    """All direct light, and interreflections by finite elements: with a target error, finer ones until it is met."""
+    exact = _brute_force(direct, None, scene, settings, clock, progress, None)
+    if indirect is None:
+        return exact
+
+    def attempt(effort: tuple[int, float] | None) -> Parts:
+        rays, tolerance = effort or _GATHER
+        with clock.phase("gather_rays"):
+            solver = GatherTransport(
+                scene, direct.lighting, direct.points, rays, settings.max_depth, settings.seed
+            )
+        with clock.phase("interreflection"):
+            part = solver.indirect(exact.direct, tolerance)
+        skipped = [
+            f"interreflections after {part.bounces}: next to no light",
+            f"singular values of the first bounce below {part.left_out:.1%} of its energy's root",
+        ]
+        return replace(exact, indirect=part, rays={"gather": len(direct.points) * rays}, skipped=skipped)
+
+    parts = _refined(attempt, _FINER_GATHER, direct, scene, settings, clock)
+    return replace(
+        parts,
+        elements_evaluated=exact.elements_evaluated,
+        elements=exact.elements,
+        rays=exact.rays | parts.rays,
+    )
+
+
+def _refined(
+    attempt: Callable[[Any], Parts],
+    efforts: Sequence[Any],
+    direct: DirectTransport,
+    scene: Scene,
+    settings: Settings,
+    clock: Stopwatch,
+) -> Parts:
+    """The first of some attempts that meets the target error, or the last; where there is no target, the default one.
 
     Each attempt is judged by held-out elements of its own; those of the report decide nothing.
     """
-    if settings.method == "huang2010":
-        return huang2010_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint)
     if settings.target_error is None:
-        return sparse_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint)
+        return attempt(None)
     attempts: list[Parts] = []
-    for number, fraction in enumerate(_DENSE_FRACTIONS):
-        parts = sparse_parts(scene, direct, indirect, settings.seed, clock, progress, checkpoint, fraction)
-        attempts.append(parts)
-        transport = _matrix(scene, direct.points, direct.lighting, settings.basis, parts)
+    for number, effort in enumerate(efforts):
+        attempts.append(attempt(effort))
+        transport = _matrix(scene, direct.points, direct.lighting, settings.basis, attempts[-1])
         with clock.phase("held_out"):
             judge = replace(settings, seed=settings.seed + _JUDGES + number)
             error = _held_out_error(scene, transport, judge)["total"]
@@ -352,7 +410,7 @@ def _forecast(
         )
     with clock.phase("pilot"):
         seconds = n * share.rays * _seconds_per_row(direct)
-        if indirect:
+        if indirect and share.paths:
             seconds += n * share.paths * _seconds_per_row(indirect)
     if progress:
         tqdm.write(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 
-METHODS = ("brute_force", "sparse", "huang2010")
+METHODS = ("brute_force", "sparse", "huang2010", "gather")
 BASES = ("direction", "texel")
 
 
@@ -35,7 +35,7 @@ class Settings:
         if self.method not in METHODS:
             raise PrtError(f"unknown method {self.method!r}; choose one of: {', '.join(METHODS)}")
         if self.method != "brute_force":
-            if self.basis != "direction":
+            if self.basis != "direction" and self.method != "gather":
                 raise PrtError(f'method {self.method!r} works in the direction basis; set basis="direction"')
             if self.indirect_resolution not in (None, self.resolution):
                 raise PrtError(

@@ -20,11 +20,19 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Indirect, Interpolated, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.matrix import (
+    Factored,
+    Indirect,
+    Interpolated,
+    LightTransport,
+    MeanCosine,
+    MeshRange,
+    Visibility,
+)
 from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
-VERSION = 2
+VERSION = 3
 _VERTEX_CHUNK = 4096
 # what Zarr, zip and our own assembly raise when a file is not what it should be
 _DAMAGE = (OSError, zipfile.BadZipFile, zlib.error, LookupError, TypeError, ValueError, RuntimeError)
@@ -149,6 +157,9 @@ def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
         arrays |= {"mean_cosine": direct.fixed}
     if isinstance(indirect, Indirect):
         arrays |= {"indirect": indirect.density, **_sparse_arrays("upsampling", indirect.upsampling)}
+    elif isinstance(indirect, Factored):
+        for name, factors in (("left", indirect.left), ("right", indirect.right)):
+            arrays |= {f"{name}_{c}": factor for c, factor in enumerate(factors)}
     return arrays
 
 
@@ -180,23 +191,34 @@ def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Li
             direct = Interpolated(direct, _sparse_matrix("weights_direct", arrays, len(direct.bits)))
     else:
         direct = MeanCosine(arrays["mean_cosine"], lighting)
-    indirect: Indirect | Interpolated | None = None
-    if attributes["indirect"]:
-        density = arrays["indirect"]
-        indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
-        if "weights_indirect_data" in arrays:
-            indirect = Interpolated(indirect, _sparse_matrix("weights_indirect", arrays, len(density)))
     return LightTransport(
         lighting=lighting,
         basis=attributes["basis"],
         albedo=arrays["albedo"],
         direct=direct,
-        indirect=indirect,
+        indirect=_indirect(arrays, lighting) if attributes["indirect"] else None,
         meshes=tuple(MeshRange(name, slice(a, b)) for name, a, b in attributes["meshes"]),
         vertex_keys=arrays["vertex_keys"],
         scene_hash=attributes["scene_hash"],
         report=attributes["report"],
     )
+
+
+def _indirect(
+    arrays: dict[str, NDArray[Any]], lighting: CubemapLighting
+) -> Indirect | Interpolated | Factored:
+    if "left_0" in arrays:
+        left, right = (
+            [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
+        )
+        if len(left) not in (1, 3) or [a.shape[1] for a in left] != [b.shape[0] for b in right]:
+            raise ValueError("factors of the indirect light do not fit together")
+        return Factored(tuple(left), tuple(right))
+    density = arrays["indirect"]
+    indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
+    if "weights_indirect_data" in arrays:
+        return Interpolated(indirect, _sparse_matrix("weights_indirect", arrays, len(density)))
+    return indirect
 
 
 def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> None:
@@ -216,6 +238,11 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
         "weights_direct_indptr": (n + 1,),
         "weights_indirect_indptr": (n + 1,),
     }
+    for name, array in arrays.items():
+        if name.startswith("left_"):
+            expected[name] = (n, *array.shape[1:])
+        elif name.startswith("right_"):
+            expected[name] = (*array.shape[:1], m)
     for name, shape in expected.items():
         if name in arrays and arrays[name].shape != shape:
             raise ValueError(f"array {name} has shape {arrays[name].shape} instead of {shape}")

@@ -12,7 +12,7 @@ import pytest
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.matrix import Indirect, LightTransport, MeanCosine, MeshRange, Visibility
+from mi_sparse_prt.matrix import Factored, Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.scene import Scene
 
 matplotlib.use("Agg")
@@ -20,7 +20,14 @@ T = mi.ScalarTransform4f
 ARTEFACTS = Path(__file__).parent / "artefacts"
 GREY = ((0.5,) * 3, (0.6,) * 3, (0.7,) * 3)  # ground, ball, box
 COLOURS = ((0.8, 0.5, 0.2), (0.1, 0.4, 0.8), (0.3, 0.9, 0.3))
-FORMS = ("bits", "fixed point", "bits and coarse indirect", "fixed point and full indirect")
+FORMS = (
+    "bits",
+    "fixed point",
+    "bits and coarse indirect",
+    "fixed point and full indirect",
+    "bits and factored light",
+    "fixed point and factored grey light",
+)
 
 
 def diffuse(*rgb: float) -> dict:
@@ -112,6 +119,10 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
         channels = 1 if "full" in form else 3
         density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
         indirect = Indirect(density, upsampling(coarse, lighting), lighting)
+    if "factored" in form:
+        ranks = (3,) if "grey" in form else (2, 3, 5)
+        sides = [[rng.random(shape, np.float32) for shape in ((n_vertices, r), (r, m))] for r in ranks]
+        indirect = Factored(tuple(a for a, _ in sides), tuple(b for _, b in sides))
     return LightTransport(
         lighting=lighting,
         basis="direction" if form.startswith("bits") else "texel",

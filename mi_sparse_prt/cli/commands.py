@@ -120,6 +120,7 @@ class Method(StrEnum):
     brute_force = "brute_force"
     sparse = "sparse"
     huang2010 = "huang2010"
+    gather = "gather"
 
 
 @app.command()
@@ -141,7 +142,8 @@ def precompute(
     method: Annotated[
         Method,
         typer.Option(
-            help="Evaluate every element, few of them (sparse), or few as in the paper (huang2010)."
+            help="Evaluate every element, few of them (sparse), few as in the paper (huang2010), or all direct "
+            "light, and interreflections by finite elements (gather)."
         ),
     ] = Method.brute_force,
     basis: Annotated[

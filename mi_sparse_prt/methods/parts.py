@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_sparse_prt.matrix import Indirect, Interpolated, MeanCosine, Visibility
+from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 
 
 @dataclass
@@ -28,7 +28,7 @@ class Parts:
     """
 
     direct: Visibility | MeanCosine | Interpolated
-    indirect: Indirect | Interpolated | None
+    indirect: Indirect | Interpolated | Factored | None
     elements_evaluated: int
     elements: dict[str, int]
     rays: dict[str, int]

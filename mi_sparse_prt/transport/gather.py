@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Interpolated, MeanCosine, Visibility
+from mi_sparse_prt.matrix import Factored, Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import BITS
@@ -43,48 +43,19 @@ Direct = Visibility | MeanCosine | Interpolated
 
 
 @dataclass(frozen=True)
-class LowRank:
-    """Indirect light as a product of factors, white transport.
+class Gathered(Factored):
+    """Indirect light, and how it was found.
 
     Attributes
     ----------
-    left : tuple of (n_v, rank) float32
-        One per channel: 1 in a grey scene, else 3. Ranks may differ.
-    right : tuple of (rank, n_directions) float32
     left_out : float
         Estimated relative L2 error of the first bounce, for its low rank alone.
     bounces : int
         Interreflections that were added up.
     """
 
-    left: tuple[Floats, ...]
-    right: tuple[Floats, ...]
     left_out: float
     bounces: int
-
-    @property
-    def ranks(self) -> tuple[int, ...]:
-        """Of each channel."""
-        return tuple(len(right) for right in self.right)
-
-    @property
-    def nbytes(self) -> int:
-        return sum(factor.nbytes for factor in (*self.left, *self.right))
-
-    def rows(self, ids: NDArray[np.integer]) -> Floats:
-        return np.stack([a[ids] @ b for a, b in zip(self.left, self.right, strict=True)], axis=-1)
-
-    def columns(self, ids: NDArray[np.integer]) -> Floats:
-        return np.stack([a @ b[:, ids] for a, b in zip(self.left, self.right, strict=True)], axis=-1)
-
-    def relight(self, lighting: Floats) -> Floats:
-        if len(self.left) == 1:
-            return self.left[0] @ (self.right[0] @ lighting)
-        pairs = zip(self.left, self.right, lighting.T, strict=True)
-        return np.stack([a @ (b @ light) for a, b, light in pairs], axis=-1)
-
-    def reordered(self, source: NDArray[np.integer]) -> LowRank:
-        return replace(self, left=tuple(left[source] for left in self.left))
 
 
 class GatherTransport:
@@ -181,7 +152,7 @@ class GatherTransport:
             found.append(light.transposed(total))
         return np.stack(found, axis=-1)
 
-    def indirect(self, direct: Direct, tolerance: float = 0.03) -> LowRank:
+    def indirect(self, direct: Direct, tolerance: float = 0.03) -> Gathered:
         """Indirect light for all texels, factored.
 
         Parameters
@@ -193,14 +164,14 @@ class GatherTransport:
 
         Returns
         -------
-        LowRank
+        Gathered
         """
         count = self._count_for(direct)
         bases, missed = self._bases(direct, tolerance if count else np.inf)
         light = _Columns(direct, np.arange(self.lighting.n_directions))
         left, right, dropped = self._truncated(light, bases, tolerance**2 - missed)
         totals = tuple(np.ascontiguousarray(x) for x in self._all_bounces(left, count))
-        return LowRank(totals, tuple(right), float(np.sqrt(missed + dropped)), count)
+        return Gathered(totals, tuple(right), float(np.sqrt(missed + dropped)), count)
 
     def _count_for(self, direct: Direct) -> int:
         return self.bounces(direct.relight(np.ones((self.lighting.n_directions, 3), np.float32))[:, 0])

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.matrix import Indirect, Interpolated, MeanCosine, Visibility
+from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
 
 BLOCK = (
@@ -14,7 +14,7 @@ BLOCK = (
 )  # elements at a time: an interpolated one has up to 40 dense ones, those four coarse ones each
 
 Ids = NDArray[np.integer]
-AnyPart = Visibility | MeanCosine | Indirect | Interpolated
+AnyPart = Visibility | MeanCosine | Indirect | Interpolated | Factored
 
 
 def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
@@ -39,6 +39,8 @@ def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
     blocks = [slice(a, a + BLOCK) for a in range(0, max(len(ids), 1), BLOCK)]
     if isinstance(part, Indirect):
         return np.concatenate([_interreflected(part, ids[b], texels[b]) for b in blocks])
+    if isinstance(part, Factored):
+        return np.concatenate([_multiplied(part, ids[b], texels[b]) for b in blocks])
     return np.concatenate([_interpolated(part, ids[b], texels[b]) for b in blocks])
 
 
@@ -55,6 +57,11 @@ def _interreflected(part: Indirect, ids: Ids, texels: Ids) -> NDArray[np.float32
     density = part.density[ids[element], coarse].astype(np.float32)  # [entry, channel]
     fine = _summed(element, weights, density, len(ids))
     return fine * part.lighting.solid_angles[texels][:, None]
+
+
+def _multiplied(part: Factored, ids: Ids, texels: Ids) -> NDArray[np.float32]:
+    pairs = zip(part.left, part.right, strict=True)
+    return np.stack([np.einsum("mr,rm->m", a[ids], b[:, texels]) for a, b in pairs], axis=1)
 
 
 def _interpolated(part: Interpolated, ids: Ids, texels: Ids) -> NDArray[np.float32]:

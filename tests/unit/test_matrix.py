@@ -9,7 +9,7 @@ from conftest import FORMS, build, diffuse, made_up, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.matrix import Factored, LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import vertex_points
 
 N_V, N = 50, 4
@@ -30,7 +30,10 @@ def slow(transport: LightTransport) -> NDArray[np.float64]:
                 white = np.full(3, visible * max(0.0, cosine) * solid_angle / np.pi)
             else:
                 white = np.full(3, transport.direct.fixed[i, j] / 65535 * solid_angle / np.pi)
-            if transport.indirect is not None:
+            if isinstance(transport.indirect, Factored):
+                pairs = zip(transport.indirect.left, transport.indirect.right, strict=True)
+                white += [a[i].astype(float) @ b[:, j].astype(float) for a, b in pairs]
+            elif transport.indirect is not None:
                 weights = transport.indirect.upsampling.toarray()[j]
                 white += solid_angle * (weights @ transport.indirect.density[i].astype(float))
             result[i, j] = transport.albedo[i] * white
@@ -169,6 +172,8 @@ def test_bytes_are_those_of_the_factors():
     assert sizes["fixed point"] == N_V * 96 * 2
     assert sizes["bits and coarse indirect"] == sizes["bits"] + N_V * 24 * 3 * 2
     assert sizes["fixed point and full indirect"] == sizes["fixed point"] + N_V * 96 * 2
+    assert sizes["bits and factored light"] == sizes["bits"] + (N_V + 96) * (2 + 3 + 5) * 4
+    assert sizes["fixed point and factored grey light"] == sizes["fixed point"] + (N_V + 96) * 3 * 4
 
 
 # ------------------------------------------------------------------------------------ other vertex orders

@@ -1,0 +1,137 @@
+"""``method="gather"`` from scene to file: exact direct light, and interreflections by finite elements."""
+
+import numpy as np
+import pytest
+from conftest import COLOURS, GREY, build, still_life
+from numpy.typing import NDArray
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.matrix import Factored
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.validation.elements import elements
+
+LIGHTING = prt.CubemapLighting(8)
+FINE = 0.1  # edges, for interpolation on them to be good
+
+
+@pytest.fixture(scope="module")
+def scene() -> prt.Scene:
+    return build(FINE, **still_life(COLOURS))
+
+
+@pytest.fixture(scope="module")
+def gathered(scene: prt.Scene) -> prt.LightTransport:
+    return prt.precompute(scene, LIGHTING, method="gather", progress=False)
+
+
+def test_direct_light_is_that_of_brute_force(scene, gathered):
+    exact = prt.precompute(scene, LIGHTING, max_depth=2, progress=False)
+    assert np.array_equal(gathered.direct.bits, exact.direct.bits)
+
+
+@pytest.mark.parametrize("basis", ["direction", "texel"])
+def test_errors_are_small_and_the_estimate_knows_them(scene, gathered, basis):
+    """Indirect rows of 200 vertices against 2 x 64 paths per element, whose noise two halves take out.
+
+    Expected: 3% of the whole at most. In the direction basis there is no other error, and the estimate is within 3 of
+    its standard errors or a fifth.
+    """
+    transport = gathered
+    if basis == "texel":
+        transport = prt.precompute(scene, LIGHTING, method="gather", basis=basis, progress=False)
+    chosen = np.sort(np.random.default_rng(1).choice(len(scene.positions), 200, replace=False))
+    ours = scene.albedo[chosen][:, None] * transport.indirect.rows(chosen)
+    halves = [_paths(scene, chosen, basis, seed) for seed in (5, 6)]
+    square = np.vdot(ours - halves[0], ours - halves[1]) / np.vdot(*[transport.rows(chosen)] * 2)
+    measured = float(np.sqrt(max(square, 0)))
+    estimate = transport.report["estimated_error"]
+    spread = estimate["standard_error"]["total"]
+    print(f"measured {measured:.3%}, estimated {estimate['total']:.3%} +- {spread:.3%}")
+    assert measured < 0.03
+    if basis == "direction":
+        assert estimate["total"] == pytest.approx(measured, abs=max(3 * spread, 0.2 * measured + 1e-3))
+
+
+def _paths(scene: prt.Scene, chosen: NDArray, basis: str, seed: int) -> NDArray:
+    """Indirect rows of some vertices by 64 paths per element."""
+    solver = PathTransport(
+        scene.normalised, LIGHTING, vertex_points(scene), basis, max_depth=5, spp=64, seed=seed
+    )
+    white = solver.rows(chosen).mean * LIGHTING.solid_angles[:, None]
+    return scene.albedo[chosen][:, None] * white
+
+
+def test_rows_columns_and_relight_are_one_matrix(gathered):
+    part = gathered.indirect
+    assert isinstance(part, Factored) and len(part.left) == 3
+    full = gathered.rows(np.arange(gathered.shape[0]))
+    some = np.array([5, 100, 383])
+    assert np.allclose(gathered.columns(some), full[:, some], rtol=1e-5, atol=1e-7)
+    light = np.random.default_rng(0).random((384, 3)).astype(np.float32)
+    expected = np.einsum("njc,jc->nc", full, light)
+    assert np.allclose(gathered.relight(light), expected, rtol=1e-5, atol=1e-5 * expected.max())
+    ids, texels = np.array([0, 7, 7, 900]), np.array([0, 3, 383, 11])
+    single = elements(part, ids, texels)
+    assert np.allclose(single, part.rows(ids)[np.arange(4), texels], rtol=1e-5, atol=1e-8)
+
+
+def test_files_and_other_orders(tmp_path, scene, gathered):
+    gathered.save(tmp_path / "a.prt")
+    again = prt.load_transport(tmp_path / "a.prt")
+    for side in ("left", "right"):
+        factors = zip(getattr(gathered.indirect, side), getattr(again.indirect, side), strict=True)
+        assert all(np.array_equal(a, b) for a, b in factors)
+    assert again.report == gathered.report
+    source = np.random.default_rng(0).permutation(gathered.shape[0])
+    turned = gathered.indirect.reordered(source)
+    assert np.array_equal(turned.rows([3]), gathered.indirect.rows(source[[3]]))
+
+
+def test_the_report_says_what_was_left_out(gathered):
+    report = gathered.report
+    assert report["parameters"]["method"] == "gather"
+    assert report["elements"] == {"direct": report["elements_total"], "indirect": 0}
+    assert report["rays"]["gather"] == 256 * gathered.shape[0]
+    assert any("interreflections" in sentence for sentence in report["skipped"])
+    phases = {name: s for name, s in report["seconds"].items() if name not in ("total", "compile")}
+    assert sum(phases.values()) == pytest.approx(report["seconds"]["total"], rel=0.02)
+    assert {"direct", "gather_rays", "interreflection"} <= phases.keys()
+
+
+def test_a_target_error_is_met_by_more_rays():
+    """A loose target takes the first attempt; a tight one costs more, and the report counts all attempts."""
+    scene = build(FINE, **still_life(GREY))
+    loose, tight = (
+        prt.precompute(scene, LIGHTING, method="gather", target_error=target, progress=False).report
+        for target in (0.5, 0.012)
+    )
+    n = len(scene.positions)
+    assert loose["rays"]["gather"] == 64 * n
+    assert tight["rays"]["gather"] >= (64 + 256) * n
+    assert tight["estimated_error"]["total"] < loose["estimated_error"]["total"]
+    assert tight["elements_evaluated"] == loose["elements_evaluated"]
+
+
+def test_without_interreflections_it_is_direct_light(scene):
+    for transport in (
+        prt.precompute(scene, LIGHTING, method="gather", max_depth=2, progress=False),
+        prt.precompute(build(0.5, ground=still_life()["ground"]), LIGHTING, method="gather", progress=False),
+    ):
+        assert transport.indirect is None
+        assert "gather" not in transport.report["rays"]
+
+
+def test_other_materials_are_refused_by_name():
+    shapes = still_life()
+    shapes["box"]["bsdf"] = {"type": "roughconductor"}
+    with pytest.raises(PrtError, match="diffuse"):
+        prt.precompute(build(0.5, **shapes), LIGHTING, method="gather", progress=False)
+
+
+def test_same_seed_same_matrix(scene, gathered):
+    again = prt.precompute(scene, LIGHTING, method="gather", progress=False)
+    assert np.array_equal(again.rows([1, 50]), gathered.rows([1, 50]))
+    other = prt.precompute(scene, LIGHTING, method="gather", seed=1, progress=False)
+    assert not np.array_equal(other.rows([1, 50]), gathered.rows([1, 50]))
