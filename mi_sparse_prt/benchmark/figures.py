@@ -124,12 +124,12 @@ def method_figures(report: dict[str, Any], pictures: MethodPictures) -> dict[str
     Returns
     -------
     dict
-        ``rates`` (Figure 9), ``errors_times`` (10), ``breakdown`` (12), ``environments``, ``rotation``; if the scene
-        has a sensor ``dense_vertices`` and ``ranks`` (2, 13), and per method ``vertex_error_METHOD`` and
-        ``relit_METHOD`` (1, 14).
+        ``rates`` (Figure 9, of methods that leave elements out), ``errors_times`` (10), ``breakdown`` (12),
+        ``environments``, ``rotation``; if the scene has a sensor ``dense_vertices`` and ``ranks`` (2, 13), and per
+        method ``vertex_error_METHOD`` and ``relit_METHOD`` (1, 14).
     """
-    figures = {
-        "rates": rates(report),
+    figures = {} if not any(m["sampling"] for m in report["methods"].values()) else {"rates": rates(report)}
+    figures |= {
         "errors_times": errors_times(report),
         "breakdown": breakdown(report),
         "environments": environments(report),

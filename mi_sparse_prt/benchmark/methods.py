@@ -15,19 +15,21 @@ from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene import Scene
 
-METHODS = ("sparse", "huang2010")
+METHODS = ("sparse", "huang2010", "gather")
 WARM_UP = 4  # texels per edge of a face
 # Phases as Figure 12 names them; what is not listed is its "system time"
 STAGES = {
-    "dense rays": ("pilot", "dense_rays", "dense_paths"),  # the pilot asks rays whether surfaces meet
+    # the pilot asks rays whether surfaces meet; to "gather" all vertices are dense
+    "dense rays": ("pilot", "direct", "dense_rays", "dense_paths"),
     "sparse rays": ("sparse_rays", "sparse_paths"),
     "spatial sampling": ("spatial_sampling",),
     "rank": ("rank",),
     "angular sampling": ("angular_sampling", "features"),
-    "solver": ("solver", "low_rank", "consensus", "repair"),
+    "gather rays": ("gather_rays",),
+    "solver": ("solver", "low_rank", "consensus", "repair", "interreflection"),
     "held out": ("held_out",),
 }
-RAYS = ("dense rays", "sparse rays", "held out")  # the held-out error is paths
+RAYS = ("dense rays", "sparse rays", "gather rays", "held out")  # the held-out error is paths
 
 
 def measure_methods(
@@ -37,7 +39,7 @@ def measure_methods(
     progress: bool = True,
     figures: Path | None = None,
 ) -> dict[str, Any]:
-    """Run methods on a scene, direct light and three interreflections, 16 paths per element.
+    """Run methods on a scene, direct light and three interreflections, 16 paths per element (``"gather"`` has none).
 
     Parameters
     ----------
@@ -60,8 +62,9 @@ def measure_methods(
         - ``seconds`` per phase, ``stages`` as in Figure 12; ``ratio`` of its time to that of brute force and
           ``elements`` (share of all), both with the held-out elements, and in ``without_held_out`` without;
           ``seconds_per_element``, the cost of an element relative to one of brute force; ``overhead``: all that is no
-          ray or path, as a share of its own time, and in microseconds per sparse vertex.
-        - ``elements_of_parts``, ``rays``, and ``sampling`` rates per mesh as in Figure 9.
+          ray or path, as a share of its own time, and in microseconds per sparse vertex (None without such).
+        - ``elements_of_parts``, ``rays``, and ``sampling`` rates per mesh as in Figure 9 (of methods that leave
+          elements out).
         - ``errors`` per mesh: relative L2 ``total``, ``direct`` and ``indirect``, all relative to the whole matrix of
           the mesh but the direct one, which is relative to the direct matrix; ``standard_error`` of those that are
           sampled; the worst of sampled whole ``rows``, and of all ``direct_rows`` and ``direct_columns``.
@@ -113,6 +116,7 @@ def _cost(transport: LightTransport, brute_force: float) -> dict[str, Any]:
     overhead = seconds["total"] - sum(stages[name] for name in RAYS)
     evaluated = made["elements_evaluated"]
     elements = (evaluated + made["estimated_error"]["elements"]) / total
+    sparse = _sparse_vertices(transport)
     ratio = seconds["total"] / brute_force
     own = seconds["total"] - seconds["held_out"]
     return {
@@ -124,7 +128,7 @@ def _cost(transport: LightTransport, brute_force: float) -> dict[str, Any]:
         "seconds_per_element": ratio / elements,
         "overhead": {
             "share": overhead / seconds["total"],
-            "microseconds_per_sparse_vertex": 1e6 * overhead / max(_sparse_vertices(transport), 1),
+            "microseconds_per_sparse_vertex": 1e6 * overhead / sparse if sparse else None,
         },
         "elements_of_parts": {name: count / total for name, count in made["elements"].items()},
         "rays": made["rays"],
@@ -141,8 +145,9 @@ def breakdown(seconds: dict[str, float]) -> dict[str, float]:
 
 
 def _sparse_vertices(transport: LightTransport) -> float:
+    rates = transport.report["sampling"]
     return sum(
-        (1 - transport.report["sampling"][mesh.name]["dense_vertices"])
-        * (mesh.vertices.stop - mesh.vertices.start)
+        (1 - rates[mesh.name]["dense_vertices"]) * (mesh.vertices.stop - mesh.vertices.start)
         for mesh in transport.meshes
+        if mesh.name in rates
     )

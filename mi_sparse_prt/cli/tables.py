@@ -226,9 +226,10 @@ def _method_table(method: str, found: dict[str, Any]) -> Table:
     table.add_row("time / brute force", f"{found['ratio']:.1%} ({without['ratio']:.1%} without held out)")
     table.add_row("cost of an element, brute force = 1", f"{found['seconds_per_element']:.2f}")
     overhead = found["overhead"]
+    each = overhead["microseconds_per_sparse_vertex"]
     table.add_row(
         "overhead",
-        f"{overhead['share']:.1%}, {overhead['microseconds_per_sparse_vertex']:.0f} us per sparse vertex",
+        f"{overhead['share']:.1%}" + ("" if each is None else f", {each:.0f} us per sparse vertex"),
     )
     for mesh, rates in found["sampling"].items():
         rows = ", ".join(f"{name.replace('_', ' ')} {value:.1%}" for name, value in rates.items())

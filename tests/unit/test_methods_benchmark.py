@@ -304,11 +304,11 @@ def test_from_end_to_end(quick, tmp_path):
     scene, report_file, folder = tmp_path / "scene.xml", tmp_path / "report.json", tmp_path / "figures"
     scene.write_text(SCENE)
     arguments = ["benchmark", scene, "--resolution", 4, "--edge-length", 0.4, "--method", "sparse"]
-    arguments += ["--figures", folder, "--json", report_file]
+    arguments += ["--method", "gather", "--figures", folder, "--json", report_file]
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     report = json.loads(report_file.read_text())
-    assert list(report["methods"]) == ["sparse"]
+    assert list(report["methods"]) == ["sparse", "gather"]
     brute = report["brute_force"]
     assert brute["seconds"] == pytest.approx(brute["direct_seconds"] + brute["paths_seconds"])
     for method, found in report["methods"].items():
@@ -322,9 +322,11 @@ def test_from_end_to_end(quick, tmp_path):
         assert own + seconds["held_out"] == pytest.approx(seconds["total"])
         assert found["seconds_per_element"] == pytest.approx(found["ratio"] / found["elements"])
         assert sum(found["stages"].values()) == pytest.approx(seconds["total"])
-        rays = sum(found["stages"][name] for name in ("dense rays", "sparse rays", "held out"))
+        rays = sum(found["stages"][name] for name in methods.RAYS)
         assert found["overhead"]["share"] == pytest.approx(1 - rays / seconds["total"])
         assert found["errors"]["floor"]["standard_error"]["total"] > 0
+    assert report["methods"]["gather"]["overhead"]["microseconds_per_sparse_vertex"] is None
+    assert report["methods"]["gather"]["errors"]["floor"]["direct"] == 0
     names = {"rates", "errors_times", "breakdown", "environments", "rotation", "dense_vertices", "ranks"}
     names |= {f"{what}_{method}" for what in ("vertex_error", "relit") for method in report["methods"]}
     assert {file.name for file in folder.iterdir()} == {f"{name}.png" for name in names}
