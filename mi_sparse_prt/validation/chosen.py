@@ -29,8 +29,9 @@ BELOW_HORIZON = (
 )
 FEW = 8  # times fewer rays in that case: hardly an element is without an error
 
-PATHS = 3072  # elements of a mesh for indirect light, at most 1 / 16 of it ...
-FEWEST_PATHS = 64  # ... or as many as this
+PATHS = 6144  # elements for indirect light, shared out among meshes; at most 1 / 16 of a mesh ...
+FEW_PATHS = 512  # ... and as many as this where there are many meshes
+FEWEST_PATHS = 64  # ... or as many as this, where a mesh is small
 POOL = 8  # times as many, of which these are drawn
 EVEN = 0.2  # of them drawn without regard to the light that the matrix has there
 
@@ -102,7 +103,8 @@ def for_indirect_light(transport: LightTransport, inside: slice, rng: np.random.
     """
     assert transport.indirect is not None
     total = (inside.stop - inside.start) * transport.lighting.n_directions
-    count = max(min(PATHS, total // 16), min(FEWEST_PATHS, total))
+    share = max(PATHS // len(transport.meshes), FEW_PATHS)
+    count = max(min(share, total // 16), min(FEWEST_PATHS, total))
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start

@@ -150,6 +150,7 @@ def few(monkeypatch):
     """About 1500 rays and 150 elements by paths for a mesh."""
     monkeypatch.setattr(chosen, "FEWEST_RAYS", 1500)
     monkeypatch.setattr(chosen, "PATHS", 150)
+    monkeypatch.setattr(chosen, "FEW_PATHS", 150)
     monkeypatch.setattr(held_out, "SPP", 128)
 
 
