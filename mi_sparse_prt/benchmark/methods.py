@@ -7,7 +7,7 @@ from typing import Any
 
 from mi_sparse_prt.benchmark.figures import MethodPictures, save_figures
 from mi_sparse_prt.benchmark.lighting import RelitReference
-from mi_sparse_prt.benchmark.machine import report_header
+from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.benchmark.reference import MAX_DEPTH, SPP, Reference
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
@@ -32,6 +32,7 @@ STAGES = {
 RAYS = ("dense rays", "sparse rays", "gather rays", "held out")  # the held-out error is paths
 
 
+@kept_memory()
 def measure_methods(
     scene: Scene,
     lighting: CubemapLighting,

@@ -4,6 +4,7 @@ import json
 
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
 from conftest import COLOURS, build, diffuse, still_life
 from typer.testing import CliRunner
@@ -13,6 +14,7 @@ from mi_sparse_prt.benchmark import figures, lighting, methods, reference
 from mi_sparse_prt.benchmark.direct_error import direct_error
 from mi_sparse_prt.benchmark.estimates import mean_square, relative_l2, row_errors
 from mi_sparse_prt.benchmark.lighting import RelitReference, environments_of, path_traced
+from mi_sparse_prt.benchmark.machine import kept_memory
 from mi_sparse_prt.benchmark.reference import Reference
 from mi_sparse_prt.cli import app
 from mi_sparse_prt.errors import PrtError
@@ -331,3 +333,18 @@ def test_from_end_to_end(quick, tmp_path):
     names |= {f"{what}_{method}" for what in ("vertex_error", "relit") for method in report["methods"]}
     assert {file.name for file in folder.iterdir()} == {f"{name}.png" for name in names}
     assert all(file.stat().st_size > 3000 for file in folder.iterdir())
+
+
+def test_freed_memory_is_kept_for_a_while():
+    """Expected: inside, an array that was freed leaves its pages with the process; afterwards they go back."""
+
+    def resident_after_an_array() -> int:
+        np.ones(64 << 20, np.uint8)
+        return psutil.Process().memory_info().rss
+
+    before = resident_after_an_array()
+    with kept_memory():
+        inside = resident_after_an_array()
+    after = psutil.Process().memory_info().rss
+    assert inside - before > 50 << 20
+    assert after - before < 20 << 20
