@@ -19,7 +19,7 @@ LIT = (
 
 @dataclass(frozen=True)
 class DirectError:
-    """Squared errors and squared norms of white direct transport.
+    """Squared errors and squared norms of direct transport, means over the channels.
 
     Attributes
     ----------
@@ -88,12 +88,13 @@ def direct_error(exact: Visibility, transport: LightTransport) -> DirectError:
     meshes = {mesh.name: mesh.vertices for mesh in transport.meshes}
     columns = {name: np.zeros(n_directions) for name in meshes}
     column_norms = {name: np.zeros(n_directions) for name in meshes}
+    squared_albedo = np.square(transport.albedo).mean(axis=1)[:, None]
     for name, inside in meshes.items():
         for a in range(inside.start, inside.stop, BLOCK):
             ids = np.arange(a, min(a + BLOCK, inside.stop))
             truth = exact.rows(ids)[..., 0]
-            square = (transport.direct.rows(ids)[..., 0] - truth) ** 2
-            norm = truth**2
+            square = squared_albedo[ids] * (transport.direct.rows(ids)[..., 0] - truth) ** 2
+            norm = squared_albedo[ids] * truth**2
             rows[ids], norms[ids] = square.sum(axis=1, dtype=np.float64), norm.sum(axis=1, dtype=np.float64)
             columns[name] += square.sum(axis=0, dtype=np.float64)
             column_norms[name] += norm.sum(axis=0, dtype=np.float64)

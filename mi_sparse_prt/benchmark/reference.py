@@ -30,7 +30,7 @@ Halves = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class Reference:
-    """White transport of a scene: direct light at all elements, indirect light at some, in two independent halves.
+    """Transport of a scene: direct light at all elements, indirect light at some, in two independent halves.
 
     Parameters
     ----------
@@ -50,6 +50,7 @@ class Reference:
 
     def __init__(self, scene: Scene, lighting: CubemapLighting, progress: bool) -> None:
         self.scene, self.lighting, self.points = scene, lighting, vertex_points(scene)
+        self._albedo = scene.albedo[:, : 1 if scene.grey else 3].astype(np.float64)
         bits, self.direct_seconds = self._direct()
         self.direct = Visibility(bits, scene.normals, lighting)
         self._direct_squares = {mesh.name: self._direct_square(mesh.vertices) for mesh in scene.meshes}
@@ -92,17 +93,22 @@ class Reference:
         return stored, time.perf_counter() - start
 
     def _elements(self, name: str, spp: int, seed: int, progress: bool) -> NDArray[np.float64]:
-        """White indirect light (k, t, channels) of the chosen elements of a mesh."""
+        """Indirect light (k, t, channels) of the chosen elements of a mesh."""
         ids, texels, solver = self.vertices[name], self.texels[name], self.paths(spp, seed)
         parts, step = [], max(1, solver.block_elements // texels.shape[1])  # a wavefront
         for a in tqdm(range(0, len(ids), step), desc=f"reference {name}", disable=not progress):
             some = texels[a : a + step]
             mean = solver.elements(np.repeat(ids[a : a + step], some.shape[1]), some.ravel()).mean
             parts.append(mean.reshape(*some.shape, -1))
-        return np.concatenate(parts) * self.lighting.solid_angles[texels].astype(np.float64)[..., None]
+        solid_angles = self.lighting.solid_angles[texels].astype(np.float64)[..., None]
+        return self._reflected(ids, np.concatenate(parts) * solid_angles)
+
+    def _reflected(self, ids: NDArray[np.int64], white: NDArray[np.floating]) -> NDArray[np.float64]:
+        """What vertices (k,) send out, (k, t, channels), of white transport (k, t, 1 or channels)."""
+        return self._albedo[ids][:, None] * white
 
     def _whole_rows(self, name: str, progress: bool) -> Halves:
-        """White indirect light (k, n_directions, channels) of the chosen rows of a mesh, twice."""
+        """Indirect light (k, n_directions, channels) of the chosen rows of a mesh, twice."""
         ids, found = self._rows[name], []
         for seed in (SEED + 2, SEED + 3):
             solver = self.paths(ROW_SPP, seed)
@@ -110,7 +116,7 @@ class Reference:
             bar = tqdm(blocks, desc=f"reference rows {name}", disable=not progress)
             rows = [solver.rows(ids[a : a + solver.block_size]).mean for a in bar]
             weights = self.lighting.solid_angles.astype(np.float64)[:, None]
-            found.append(np.concatenate(rows) * weights)
+            found.append(self._reflected(ids, np.concatenate(rows) * weights))
         return found[0], found[1]
 
     def time_brute_force(self) -> dict[str, Any]:
@@ -170,8 +176,8 @@ class Reference:
         direct, found = direct_error(self.direct, transport), {}
         for name, ids in self.vertices.items():
             texels = self.texels[name]
-            wrong = _elements_of(transport.direct, ids, texels) - self._exact(name)
-            indirect = _elements_of(transport.indirect, ids, texels)
+            wrong = self._reflected(ids, _elements_of(transport.direct, ids, texels)) - self._exact(name)
+            indirect = self._reflected(ids, _elements_of(transport.indirect, ids, texels))
             x, y = (indirect - half for half in self._halves[name])
             norm = self._norm(name)
             total = relative_l2(
@@ -189,9 +195,10 @@ class Reference:
             }
         return found, direct
 
-    def _exact(self, name: str) -> NDArray[np.float32]:
-        """White direct light at the elements of a mesh, (k, t, 1)."""
-        return _elements_of(self.direct, self.vertices[name], self.texels[name])
+    def _exact(self, name: str) -> NDArray[np.float64]:
+        """Direct light at the elements of a mesh, (k, t, channels)."""
+        ids = self.vertices[name]
+        return self._reflected(ids, _elements_of(self.direct, ids, self.texels[name]))
 
     def _norm(self, name: str) -> MeanSquare:
         exact, (x, y) = self._exact(name), self._halves[name]
@@ -201,17 +208,18 @@ class Reference:
         """Mean square of the direct elements of a mesh."""
         total = 0.0
         for a in range(inside.start, inside.stop, BLOCK):
-            rows = self.direct.rows(np.arange(a, min(a + BLOCK, inside.stop)))
-            total += float((rows**2).sum(dtype=np.float64))
+            ids = np.arange(a, min(a + BLOCK, inside.stop))
+            squares = (self.direct.rows(ids)[..., 0] ** 2).sum(axis=1, dtype=np.float64)
+            total += float(squares @ (self._albedo[ids] ** 2).mean(axis=1))
         return total / ((inside.stop - inside.start) * self.lighting.n_directions)
 
     def _row_error(self, transport: LightTransport, name: str) -> dict[str, Any]:
         """95th percentile and maximum of the relative L2 of whole rows."""
         ids, (x, y) = self._rows[name], self._row_halves[name]
-        exact = self.direct.rows(ids)
-        ours = transport.direct.rows(ids)
+        exact = self._reflected(ids, self.direct.rows(ids))
+        ours = self._reflected(ids, transport.direct.rows(ids))
         if transport.indirect is not None:
-            ours = ours + transport.indirect.rows(ids)
+            ours = ours + self._reflected(ids, transport.indirect.rows(ids))
         squares = ((ours - exact - x) * (ours - exact - y)).sum(axis=(1, 2))
         relative = row_errors(squares, ((exact + x) * (exact + y)).sum(axis=(1, 2)))
         found = worst(relative, 0, "vertex")
