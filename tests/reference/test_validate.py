@@ -127,7 +127,9 @@ def test_a_good_matrix_passes(scene, basis, tmp_path):
     assert json.loads(json.dumps(report)) == report
     estimated = transport.report["estimated_error"]
     assert report["estimated_error"] == estimated
-    assert report["relative_l2"]["total"] == pytest.approx(estimated["total"], rel=0.35)
+    # 700 held-out elements of the texel basis tell it within a quarter; 100 rows are a third of the matrix
+    spread = 3 * estimated["standard_error"]["total"] + 0.1 * estimated["total"]
+    assert report["relative_l2"]["total"] == pytest.approx(estimated["total"], abs=spread)
     assert report["relative_l2"]["total"] < 0.08  # texels of n = 2 are large: 4 x 4 rays leave 6%
     assert report["relative_l2"]["meshes"].keys() == {"ground", "ball", "box"}
     assert 0 < report["reference_noise"] < 0.03
