@@ -19,7 +19,7 @@ ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its ran
 RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box
 ROUNDING = 1e-9  # of the energy: 99 of 100 equal singular values hold 0.99, whatever their last bits
 LEAST_DENSE = 2  # vertices of a mesh
-SHARING = 4  # one in so many of the first iteration's vertices is the centre of a local matrix
+SHARING = 8  # one in so many of the first iteration's vertices is the centre of a local matrix
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def choose_dense(
 ) -> SpatialSamples:
     """Choose the dense vertices of one mesh in iterations, by the local rank of what is known so far ([HR10] 4.1).
 
-    The first iteration takes `step` of the vertices at random; a quarter of them are the centres of local matrices.
+    The first iteration takes `step` of the vertices at random; one in eight of them is the centre of a local matrix.
     Each later one computes the ranks of these and draws `step` more by rank, until there are `fraction` of them.
 
     Parameters
