@@ -1,0 +1,150 @@
+"""Visibility by consensus: rays are traced where neighbouring vertices disagree, and bits are copied where they agree.
+
+Vertices become known in levels, each some times as dense as the one before: the nearer the neighbours that are asked,
+the fewer directions they disagree about. What the first level knows was sampled adaptively in angle ([HR10] 4.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.reconstruction.neighbours import surface_neighbours
+from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.bits import above_horizon, listed, overwrite
+from mi_sparse_prt.sampling.features import contested, copy_agreed
+
+STRIDES = (12, 4, 2, 1)  # one vertex in so many is known after each level; each divides the one before
+NEIGHBOURS = 8  # that are asked
+LEAST_NEIGHBOURS = 3  # with fewer on its own surface, a vertex is sampled as those of the first level
+AROUND = 8  # of all vertices, for repair
+BLOCK = 1 << 14  # vertices at a time, some hundred rays each
+
+Ids = NDArray[np.int64]
+Trace = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.bool_]]
+
+
+class Consensus:
+    """Visibility of the vertices of a scene as it becomes known.
+
+    Parameters
+    ----------
+    normals : (n_v, 3) float32
+        In the frame of the lighting.
+    grid : AngularGrid
+    trace : callable
+        ``trace(vertices, texels)``, both (m,) uint32: whether vertices see the centres of texels, (m,) bool.
+
+    Attributes
+    ----------
+    visible, evaluated, above : (n_v, words) uint32 bits
+        As in ``DenseRows``.
+    """
+
+    def __init__(self, normals: NDArray[np.float32], grid: AngularGrid, trace: Trace) -> None:
+        self._grid, self._trace, self._normals = grid, trace, normals
+        self.above = above_horizon(normals, grid.lighting.directions)
+        self.visible, self.evaluated = np.zeros_like(self.above), np.zeros_like(self.above)
+
+    def sample(self, vertices: Ids) -> None:
+        """Sample rows adaptively in angle."""
+        names = vertices.astype(np.uint32)
+        rows = self._grid.sample(self._normals[vertices], lambda r, t: self._trace(names[r], t))
+        self.visible[vertices], self.evaluated[vertices] = rows.visible, rows.evaluated
+
+    def agree(self, vertices: Ids, near: NDArray[np.int32]) -> None:
+        """Give vertices (n,) what their neighbours (n, k) agree on, and traced rays elsewhere.
+
+        Neighbours are vertices whose rows are known, -1 where there are fewer.
+        """
+        copy_agreed(near, self.visible, self.above, vertices, self.above, self.visible)
+        self.repair(vertices, near)
+
+    def repair(self, vertices: Ids, near: NDArray[np.int32]) -> None:
+        """Trace where neighbours (n, k) of vertices (n,) disagree, and no ray has been traced."""
+        for a in range(0, len(vertices), BLOCK):
+            some = vertices[a : a + BLOCK]
+            asked = contested(near[a : a + BLOCK], self.visible, self.above, some, self.above, self.evaluated)
+            rows, texels = listed(asked)
+            overwrite(
+                self.visible, self.evaluated, some, asked, self._trace(some.astype(np.uint32)[rows], texels)
+            )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh, on which vertices have neighbours.
+
+    Attributes
+    ----------
+    first : int
+        Of its vertices, which follow each other.
+    positions, normals : (n, 3) float
+    keys : (n,) uint64
+        Names of the vertices.
+    """
+
+    first: int
+    positions: NDArray[np.floating]
+    normals: NDArray[np.floating]
+    keys: NDArray[np.uint64]
+
+    def levels(self) -> list[Ids]:
+        """Its vertices (counted from 0) in levels, each spread evenly; independent of the order in which they come."""
+        order = np.lexsort((self.keys, _morton(self.positions)))
+        level = np.full(len(order), len(STRIDES) - 1)
+        for number, stride in reversed(list(enumerate(STRIDES))):
+            level[::stride] = number
+        return [order[level == number] for number in range(len(STRIDES))]
+
+
+def by_levels(state: Consensus, surface: Surface) -> None:
+    """Make the rows of a mesh known, level by level, and repair them.
+
+    Parameters
+    ----------
+    state : Consensus
+    surface : Surface
+    """
+    levels = surface.levels()
+    known = levels[0]
+    state.sample(surface.first + known)
+    p, n = surface.positions, surface.normals
+    for new in levels[1:]:
+        near = surface_neighbours(p[new], n[new], p[known], n[known], NEIGHBOURS).ids
+        lonely = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
+        state.sample(surface.first + new[lonely])
+        ids = np.append(known + surface.first, -1).astype(np.int32)[near]
+        state.agree(surface.first + new[~lonely], ids[~lonely])
+        known = np.concatenate([known, new])
+    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[:, 1:]
+    state.repair(surface.first + known, np.where(around >= 0, around + surface.first, -1).astype(np.int32))
+
+
+def _morton(positions: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """Places (n,) of positions (n, 3) along Morton's curve through their box, 21 bits per axis."""
+    p = np.asarray(positions, np.float64)
+    if not len(p):
+        return np.zeros(0, np.uint64)
+    low, side = p.min(axis=0), float(np.ptp(p, axis=0).max())
+    cells = ((p - low) / max(side, 1e-30) * (2**21 - 1)).astype(np.uint64)
+    code = np.zeros(len(p), np.uint64)
+    for axis in range(3):
+        x = cells[:, axis]
+        for shift, mask in _SPREAD:
+            x = (x | x << np.uint64(shift)) & np.uint64(mask)
+        code |= x << np.uint64(axis)
+    return code
+
+
+# how bits of a number are moved apart, two empty places between them
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
