@@ -83,6 +83,8 @@ class Scene:
     normalised_positions : (n_v, 3) float32
     warnings : list of str
         What was handled on the user's behalf; each was also issued as a `PrtWarning`.
+    materials : list of Material
+        One for each mesh.
     path : str or None
         The XML file.
     """
@@ -120,7 +122,7 @@ class Scene:
             [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
         )
         self._surfaces = meshes
-        self._materials = materials
+        self.materials = materials
 
     @classmethod
     def from_mitsuba(cls, scene: mi.Scene, edge_length: float | None = None) -> Scene:
@@ -190,7 +192,7 @@ class Scene:
         return [
             _mitsuba_mesh(mesh, material.bsdf) if shape.is_emitter() else shape
             for shape, mesh, material in zip(
-                self.mitsuba.shapes(), self._surfaces, self._materials, strict=True
+                self.mitsuba.shapes(), self._surfaces, self.materials, strict=True
             )
         ]
 
@@ -202,14 +204,14 @@ class Scene:
     @property
     def diffuse(self) -> bool:
         """Whether all BSDFs reflect purely diffusely."""
-        return all(material.diffuse for material in self._materials)
+        return all(material.diffuse for material in self.materials)
 
     @cached_property
     def grey(self) -> bool:
         """Whether all surfaces provably reflect the three channels alike (within 1e-6)."""
         even = np.max(np.ptp(self.albedo, axis=1)) <= 1e-6
         return bool(even) and all(
-            k.grey(mesh) for k, mesh in zip(self._materials, self._surfaces, strict=True)
+            k.grey(mesh) for k, mesh in zip(self.materials, self._surfaces, strict=True)
         )
 
     @cached_property
@@ -226,7 +228,7 @@ class Scene:
         """
         total = np.zeros(2, np.uint64)
         digests = set()
-        for view, mesh, material in zip(self.meshes, self._surfaces, self._materials, strict=True):
+        for view, mesh, material in zip(self.meshes, self._surfaces, self.materials, strict=True):
             digest = material.digest()
             digests.add(digest)
             seed = np.frombuffer(digest[:8], np.uint64)[0]

@@ -21,7 +21,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, te
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.transport.lanes import PointArrays, TexelArrays, random_generator, start_ray
-from mi_sparse_prt.transport.path import Estimate, _has_mirrors
+from mi_sparse_prt.transport.path import Estimate, has_mirrors
 
 # Per sample of a row; a power of four. With 64 an element costs a quarter less, but the sum of a row, which is what
 # broad lights see, is then known no better than by path tracing in the same time; with 256 three times better.
@@ -73,7 +73,7 @@ class AdjointTransport:
         self.basis, self.max_depth, self.channels, self.seed = basis, max_depth, channels, seed
         self.spp = spp + spp % 2
         self._points, self._texels = PointArrays(points), TexelArrays(lighting)
-        self._sees_light = basis == "texel" and _has_mirrors(scene)
+        self._sees_light = basis == "texel" and has_mirrors(scene)
 
     @property
     def block_size(self) -> int:

@@ -179,7 +179,7 @@ class PathTransport:
         direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
         mean = self._texels.solid_angle(texel)
         light = Light(direction, solid_angle / mean)
-        if _has_mirrors(self.scene):
+        if has_mirrors(self.scene):
             light = Light(direction, solid_angle / mean, lambda d: self._texels.contains(texel, d), 1 / mean)
         return _reflected(self.scene, ray, light, rng, bounces)
 
@@ -198,7 +198,7 @@ class Light:
     radiance: mi.Float | None = None
 
 
-def _has_mirrors(scene: mi.Scene) -> bool:
+def has_mirrors(scene: mi.Scene) -> bool:
     """Whether any surface scatters into single directions."""
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes())
 

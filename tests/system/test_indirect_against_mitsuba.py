@@ -327,7 +327,7 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
         assert_unbiased(result)
         assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
 
-    monkeypatch.setattr(path_module, "_has_mirrors", lambda _: False)
+    monkeypatch.setattr(path_module, "has_mirrors", lambda _: False)
     lighting = prt.CubemapLighting(1)
     blind = PathTransport(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
     found = (blind.mean[..., 2] * scene.albedo[rows, 2, None] * lighting.solid_angles).sum()

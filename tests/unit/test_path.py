@@ -163,7 +163,7 @@ def test_light_found_in_a_mirror(mirrored, monkeypatch):
     assert together < 0.005 * exact.sum()
     assert abs(ours.sum() - exact.sum()) < 3 * together + 0.002 * exact.sum()
 
-    monkeypatch.setattr(path_module, "_has_mirrors", lambda scene: False)
+    monkeypatch.setattr(path_module, "has_mirrors", lambda scene: False)
     assert path.rows(interior).mean.max() == 0
     # light from one direction alone cannot be found by chance
     assert solver(mirrored, spp=64, max_depth=5, channels=1).rows(interior).mean.max() == 0
@@ -218,4 +218,4 @@ def test_delta_flags_are_read_from_wrapped_bsdfs():
         ({"type": "mask", "opacity": 0.5, "bsdf": diffuse(1, 1, 1)}, True),
     ):
         scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf}})
-        assert path_module._has_mirrors(scene) == mirror
+        assert path_module.has_mirrors(scene) == mirror
