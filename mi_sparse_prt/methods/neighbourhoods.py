@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.methods.dense import Dense, DenseSampler
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, surface_neighbours
+from mi_sparse_prt.reconstruction.neighbours import Neighbours, renumbered, surface_neighbours
 from mi_sparse_prt.scene import Mesh, Scene
 
 NEIGHBOURS = 12  # dense ones
@@ -30,12 +30,17 @@ class Neighbourhood:
         """Neighbours (n_sparse, k) of the sparse vertices."""
         return self.near.ids[self.sparse - self.mesh.vertices.start]
 
+    def dense_around_sparse(self, dense: Dense) -> NDArray[np.int32]:
+        """Neighbours (n_sparse, k) of the sparse vertices, by their names in the scene; -1 where there are fewer."""
+        return renumbered(self.near_sparse, dense.ids)
+
     def around_sparse(self, scene: Scene) -> NDArray[np.int32]:
-        """The nearest of all vertices (n_sparse, k) around each sparse vertex, counted from the first of the mesh."""
+        """The nearest of all vertices (n_sparse, k) around each sparse vertex, by their names in the scene."""
         inside = self.mesh.vertices
         p, n = scene.normalised_positions, scene.normals
         around = surface_neighbours(p[self.sparse], n[self.sparse], p[inside], n[inside], AROUND + 1)
-        return around.ids[:, 1:]  # the first is the vertex itself
+        # the first is the vertex itself
+        return renumbered(around.ids[:, 1:], np.arange(inside.start, inside.stop))
 
 
 def neighbourhoods(

@@ -19,11 +19,11 @@ from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.matrix import Interpolated, Visibility
 from mi_sparse_prt.methods.dense import Dense, DenseSampler
 from mi_sparse_prt.methods.indirect import indirect_part
-from mi_sparse_prt.methods.neighbourhoods import Neighbourhood, neighbourhoods
+from mi_sparse_prt.methods.neighbourhoods import neighbourhoods
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits, above_horizon, counts, listed, overwrite, pack
-from mi_sparse_prt.sampling.features import contested, copy_agreed
+from mi_sparse_prt.sampling.bits import counts, pack
+from mi_sparse_prt.sampling.consensus import Consensus
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
@@ -33,7 +33,6 @@ STEP = DENSE / 4  # of them in an iteration
 POWER = 1.5  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
-BLOCK = 1 << 14  # sparse vertices at a time, some hundred rays each
 
 
 def sparse_parts(
@@ -72,13 +71,15 @@ def sparse_parts(
         sampler.choose(mesh, dense_fraction or DENSE, RADIUS, seed, POWER, STEP)
     dense, groups = neighbourhoods(scene, sampler, clock)
 
-    state = _Visibility(direct, dense, clock)
+    state = _known(direct, dense, grid, clock)
     for group in groups:
-        state.agree(group)
+        with clock.phase("consensus"):
+            state.agree(group.sparse, group.dense_around_sparse(dense))
         with clock.phase("repair"):
+            # the nearest of all vertices are nearer than the dense ones, and know more by now
             near = group.around_sparse(scene)
-        for _ in range(ROUNDS):
-            state.repair(group, near)
+            for _ in range(ROUNDS):
+                state.repair(group.sparse, near)
 
     part, paths = None, 0
     if indirect is not None:
@@ -88,53 +89,17 @@ def sparse_parts(
     return _account(scene, direct, indirect, dense, grid, state, part, paths)
 
 
-class _Visibility:
-    """Visibility of all vertices as it becomes known.
+def _known(direct: DirectTransport, dense: Dense, grid: AngularGrid, clock: Stopwatch) -> Consensus:
+    """Visibility with the rows of dense vertices in it."""
 
-    Attributes
-    ----------
-    visible, evaluated, above : (n_v, words) uint32 bits
-        As in ``DenseRows``.
-    """
+    def trace(vertices: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
+        with clock.phase("sparse_rays"):
+            return direct.visible(vertices, texels)
 
-    def __init__(self, direct: DirectTransport, dense: Dense, clock: Stopwatch) -> None:
-        self._direct, self._dense, self._clock = direct, dense, clock
-        with clock.phase("consensus"):
-            self.above = above_horizon(direct.points.normals, direct.lighting.directions)
-            self.visible, self.evaluated = np.empty_like(self.above), np.zeros_like(self.above)
-            self.visible[dense.ids] = dense.rows.visible
-            self.evaluated[dense.ids] = dense.rows.evaluated
-
-    def agree(self, group: Neighbourhood) -> None:
-        """Rows of sparse vertices: what their dense neighbours agree on, and traced rays elsewhere."""
-        near, rows, sparse = group.near_sparse, self._dense.rows, group.sparse
-        with self._clock.phase("consensus"):
-            copy_agreed(near, rows.visible, rows.above, sparse, self.above, self.visible)
-            self._trace(sparse, contested(near, rows.visible, rows.above, sparse, self.above, self.evaluated))
-
-    def repair(self, group: Neighbourhood, near: NDArray[np.int32]) -> None:
-        """Trace where the nearest of all vertices differ: they are nearer than the dense ones, and know more by now.
-
-        Parameters
-        ----------
-        group : Neighbourhood
-        near : (n_sparse, k) int32
-            Vertices of the mesh, counted from its first.
-        """
-        visible, above = (bits[group.mesh.vertices] for bits in (self.visible, self.above))
-        with self._clock.phase("repair"):
-            self._trace(
-                group.sparse, contested(near, visible, above, group.sparse, self.above, self.evaluated)
-            )
-
-    def _trace(self, vertices: NDArray[np.int64], asked: Bits) -> None:
-        """Evaluate and keep elements (n, words), some vertices at a time: lists are long."""
-        for a in range(0, len(vertices), BLOCK):
-            some, bits = vertices[a : a + BLOCK], asked[a : a + BLOCK]
-            rows, texels = listed(bits)
-            with self._clock.phase("sparse_rays"):
-                values = self._direct.visible(some.astype(np.uint32)[rows], texels)
-            overwrite(self.visible, self.evaluated, some, bits, values)
+    with clock.phase("consensus"):
+        state = Consensus(direct.points.normals, grid, trace)
+        state.visible[dense.ids], state.evaluated[dense.ids] = dense.rows.visible, dense.rows.evaluated
+    return state
 
 
 def _account(
@@ -143,7 +108,7 @@ def _account(
     indirect: PathTransport | None,
     dense: Dense,
     grid: AngularGrid,
-    state: _Visibility,
+    state: Consensus,
     part: Interpolated | None,
     paths: int,
 ) -> Parts:

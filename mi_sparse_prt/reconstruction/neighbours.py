@@ -240,6 +240,11 @@ def inverse_distance_weights(neighbours: Neighbours) -> NDArray[np.float32]:
     return weights.astype(np.float32)
 
 
+def renumbered(ids: NDArray[np.integer], names: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Neighbours by other names: ``names[ids]``, and -1 where there are none."""
+    return np.append(names, -1).astype(np.int32)[ids]
+
+
 def finite_rows(values: NDArray[np.floating], vertex: str, what: str) -> NDArray[np.float64]:
     """As (n, 3) float64, or an error that names the first row that is not finite."""
     rows = np.asarray(values, np.float64).reshape(-1, 3)

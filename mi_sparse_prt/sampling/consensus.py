@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reconstruction.neighbours import surface_neighbours
+from mi_sparse_prt.reconstruction.neighbours import renumbered, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.bits import above_horizon, listed, overwrite
 from mi_sparse_prt.sampling.features import contested, copy_agreed
@@ -117,11 +117,12 @@ def by_levels(state: Consensus, surface: Surface) -> None:
         near = surface_neighbours(p[new], n[new], p[known], n[known], NEIGHBOURS).ids
         lonely = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
         state.sample(surface.first + new[lonely])
-        ids = np.append(known + surface.first, -1).astype(np.int32)[near]
-        state.agree(surface.first + new[~lonely], ids[~lonely])
+        state.agree(surface.first + new[~lonely], renumbered(near[~lonely], surface.first + known))
         known = np.concatenate([known, new])
-    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[:, 1:]
-    state.repair(surface.first + known, np.where(around >= 0, around + surface.first, -1).astype(np.int32))
+    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[
+        :, 1:
+    ]  # the first is the vertex itself
+    state.repair(surface.first + known, renumbered(around, surface.first + np.arange(len(p))))
 
 
 def _morton(positions: NDArray[np.floating]) -> NDArray[np.uint64]:
