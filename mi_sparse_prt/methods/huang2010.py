@@ -7,6 +7,7 @@ minimization; T(x) = sum of weights times their rows. Sampled values serve the f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,17 @@ RELATIVE_LAMBDA = 1e-2
 BLOCK = 4096  # sparse vertices at a time
 ROWS = 256  # whole rows of dense vertices at a time
 
+# The dense vertices and their rows (n_dense, n_directions), means over channels -> a function from dense neighbours
+# (n, k) of sparse vertices to the directions (n, s) in which these are sampled; -1 where there are fewer
+Columns = Callable[[Dense, NDArray[np.float32]], Callable[[NDArray[np.int32]], NDArray[np.int32]]]
+
+
+def best_of_each_vertex(
+    dense: Dense, mean: NDArray[np.float32]
+) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
+    """The paper's columns (section 5.2): 350 features of each sparse vertex's own neighbours."""
+    return lambda near: best_features(near, mean, dense.rows.features, DIRECTIONS)
+
 
 def huang2010_parts(
     scene: Scene,
@@ -48,8 +60,11 @@ def huang2010_parts(
     clock: Stopwatch,
     progress: bool,
     checkpoint: Path | None = None,
+    columns: Columns = best_of_each_vertex,
 ) -> Parts:
     """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``.
+
+    ``columns`` chooses the directions of sparse vertices, by whichever rule the paper's is to be compared with.
 
     Raises
     ------
@@ -69,7 +84,7 @@ def huang2010_parts(
         with clock.phase("dense_paths"):
             interreflected, kept = _interreflected(indirect, dense, grid, progress, checkpoint)
     weights, evaluated, sparse = _fitted(
-        scene, direct, indirect, dense, visibility, interreflected, clock, progress
+        scene, direct, indirect, dense, visibility, interreflected, columns, clock, progress
     )
     if kept:
         kept.remove()
@@ -135,6 +150,7 @@ def _fitted(
     dense: Dense,
     visibility: Visibility,
     interreflected: Indirect | None,
+    columns: Columns,
     clock: Stopwatch,
     progress: bool,
 ) -> tuple[scipy.sparse.csr_array, NDArray[np.int64], NDArray[np.int64]]:
@@ -145,7 +161,9 @@ def _fitted(
     sparse = np.flatnonzero(is_sparse)
     with clock.phase("system"):
         stacked, mean = whole_rows(visibility, interreflected)
-    owners, columns, values = [dense.ids], [np.arange(len(dense.ids))], [np.ones(len(dense.ids))]
+    with clock.phase("features"):
+        directions_of = columns(dense, mean)
+    owners, used_rows, values = [dense.ids], [np.arange(len(dense.ids))], [np.ones(len(dense.ids))]
     cost = np.zeros(len(sparse), np.int64)
     with tqdm(total=len(sparse), desc="sparse", unit=" vertices", disable=not progress) as bar:
         for a in range(0, len(sparse), BLOCK):
@@ -153,7 +171,7 @@ def _fitted(
             with clock.phase("neighbours"):
                 near = _near(scene, ids, dense)
             with clock.phase("features"):
-                directions = best_features(near, mean, dense.rows.features, DIRECTIONS)
+                directions = directions_of(near)
             cost[a : a + len(ids)] = (directions >= 0).sum(axis=1)
             sampled = _sampled(direct, indirect, ids, directions, clock)
             with clock.phase("solver"):
@@ -163,12 +181,12 @@ def _fitted(
                 fit[alone] = (near[alone] >= 0) / np.maximum((near[alone] >= 0).sum(axis=1, keepdims=True), 1)
                 used = fit != 0
                 owners.append(np.repeat(ids, used.sum(axis=1)))
-                columns.append(near[used])
+                used_rows.append(near[used])
                 values.append(fit[used])
             bar.update(len(ids))
     entries = (
         np.concatenate(values).astype(np.float32),
-        (np.concatenate(owners), np.concatenate(columns)),
+        (np.concatenate(owners), np.concatenate(used_rows)),
     )
     return scipy.sparse.coo_array(entries, shape=(n, len(dense.ids))).tocsr(), cost, sparse
 

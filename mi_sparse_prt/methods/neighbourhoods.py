@@ -13,7 +13,7 @@ from mi_sparse_prt.reconstruction.neighbours import Neighbours, renumbered, surf
 from mi_sparse_prt.scene import Mesh, Scene
 
 NEIGHBOURS = 12  # dense ones
-AROUND = 20  # of all vertices
+AROUND = 12  # of all vertices
 LEAST_NEIGHBOURS = 3  # with fewer a vertex becomes dense
 
 
@@ -34,11 +34,11 @@ class Neighbourhood:
         """Neighbours (n_sparse, k) of the sparse vertices, by their names in the scene; -1 where there are fewer."""
         return renumbered(self.near_sparse, dense.ids)
 
-    def around_sparse(self, scene: Scene) -> NDArray[np.int32]:
-        """The nearest of all vertices (n_sparse, k) around each sparse vertex, by their names in the scene."""
+    def around(self, scene: Scene) -> NDArray[np.int32]:
+        """The nearest of all vertices (n, k) around each vertex, by their names in the scene."""
         inside = self.mesh.vertices
-        p, n = scene.normalised_positions, scene.normals
-        around = surface_neighbours(p[self.sparse], n[self.sparse], p[inside], n[inside], AROUND + 1)
+        p, n = scene.normalised_positions[inside], scene.normals[inside]
+        around = surface_neighbours(p, n, p, n, AROUND + 1)
         # the first is the vertex itself
         return renumbered(around.ids[:, 1:], np.arange(inside.start, inside.stop))
 

@@ -30,7 +30,7 @@ from mi_sparse_prt.transport.path import PathTransport
 
 DENSE = 0.22  # of the vertices of a mesh
 STEP = DENSE / 4  # of them in an iteration
-POWER = 1.5  # of the rank, by which they are drawn: errors of indirect light gather where things meet
+POWER = 1.75  # of the rank, by which they are drawn: errors of indirect light gather where things meet
 RADIUS = 0.05  # of a local matrix, in longest sides of the scene: [HR10] has 0.2 on a ground of 4
 ROUNDS = 2  # of repair
 
@@ -76,10 +76,11 @@ def sparse_parts(
         with clock.phase("consensus"):
             state.agree(group.sparse, group.dense_around_sparse(dense))
         with clock.phase("repair"):
-            # the nearest of all vertices are nearer than the dense ones, and know more by now
-            near = group.around_sparse(scene)
+            # the nearest of all vertices are nearer than the dense ones, and know more by now; what dense rows have
+            # borrowed in angle is compared as well
+            near, inside = group.around(scene), group.mesh.vertices
             for _ in range(ROUNDS):
-                state.repair(group.sparse, near)
+                state.repair(np.arange(inside.start, inside.stop), near)
 
     part, paths = None, 0
     if indirect is not None:
