@@ -258,11 +258,11 @@ def test_lamps_do_not_take_part_in_reference_images():
     assert without < 1.01
 
 
-# ------------------------------------------------------------------------------------ the five scenes
+# ------------------------------------------------------------------------------------ the shipped scenes
 
 
 #: Edge lengths for what has no fine mesh of its own.
-EDGES = {"cornell": 0.1, "terrace": 0.2}
+EDGES = {"cornell": 0.1, "terrace": 0.2, "pergola": 0.2}
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Loading: vertices, normals, albedo, the unit-box copy, hashes, and what is refused."""
 
+import runpy
 import warnings
 from pathlib import Path
 
@@ -682,6 +683,8 @@ def test_parameters_reach_the_xml_and_unknown_ones_are_refused(tmp_path: Path) -
         ("spot", (29241 + 3225, 35000), False),
         ("cornell", (10000, 40000), False),
         ("terrace", (10000, 40000), False),
+        ("foliage", (20000, 60000), False),
+        ("pergola", (20000, 60000), False),
     ],
 )
 def test_shipped_scenes(name: str, vertices: tuple[int, int], grey: bool) -> None:
@@ -699,6 +702,26 @@ def test_shipped_scenes(name: str, vertices: tuple[int, int], grey: bool) -> Non
     assert image.shape == (30, 40, 3)
     assert np.isfinite(image).all()
     assert image.mean() > 0.05
+
+
+@pytest.mark.parametrize("maker", ["foliage", "pergola"])
+def test_shipped_meshes_are_what_their_scripts_make(
+    maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same triangles, and vertices within rounding: libraries differ in the last bit."""
+    folder = SCENES / "meshes"
+    monkeypatch.syspath_prepend(folder)
+    runpy.run_path(str(folder / f"{maker}.py"))["main"](tmp_path)
+    made = sorted(tmp_path.iterdir())
+    assert len(made) >= 3
+    for path in made:
+        again, shipped = (
+            mi.load_dict({"type": "ply", "filename": str(f / path.name)}) for f in (tmp_path, folder)
+        )
+        assert (again.faces_buffer() == shipped.faces_buffer()).numpy().all()
+        np.testing.assert_allclose(
+            again.vertex_positions_buffer().numpy(), shipped.vertex_positions_buffer().numpy(), atol=1e-5
+        )
 
 
 def test_shipped_scenes_hash_alike_at_every_load() -> None:
