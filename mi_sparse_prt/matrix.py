@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
@@ -120,7 +121,7 @@ def _relight_bits(
 
 @dataclass(frozen=True)
 class MeanCosine:
-    """Direct light in the texel basis: the mean of V max(0, n . w) over each texel.
+    """Direct light in the texel basis, by brute force: the mean of V max(0, n . w) over each texel.
 
     Attributes
     ----------
@@ -314,7 +315,7 @@ class LightTransport:
     lighting: CubemapLighting
     basis: str
     albedo: NDArray[np.float32]
-    direct: Visibility | MeanCosine | Interpolated
+    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated
     indirect: Indirect | Interpolated | Factored | None
     meshes: tuple[MeshRange, ...]
     vertex_keys: NDArray[np.uint64]

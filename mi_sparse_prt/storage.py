@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import (
     Factored,
     Indirect,
@@ -32,8 +33,9 @@ from mi_sparse_prt.matrix import (
 from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
-VERSION = 3
-_VERTEX_CHUNK = 4096
+VERSION = 4
+_VERTEX_CHUNK = 4096  # rows
+_LIST_CHUNK = 1 << 20  # numbers of a plain list
 # what Zarr, zip and our own assembly raise when a file is not what it should be
 _DAMAGE = (OSError, zipfile.BadZipFile, zlib.error, LookupError, TypeError, ValueError, RuntimeError)
 
@@ -136,7 +138,8 @@ def _write(transport: LightTransport, path: str) -> None:
     try:
         group = zarr.create_group(store, attributes=attributes)
         for name, array in _arrays(transport).items():
-            chunks = (min(_VERTEX_CHUNK, max(1, len(array))), *array.shape[1:])
+            length = _VERTEX_CHUNK if array.ndim > 1 else _LIST_CHUNK
+            chunks = (min(length, max(1, len(array))), *array.shape[1:])
             group.create_array(name, data=array, chunks=chunks, config={"write_empty_chunks": True})
     finally:
         store.close()
@@ -153,6 +156,9 @@ def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
         indirect = indirect.dense  # type: ignore[assignment]
     if isinstance(direct, Visibility):
         arrays |= {"visibility": direct.bits, "normals": direct.normals}
+    elif isinstance(direct, FractionalVisibility):
+        arrays |= {"visibility": direct.bits, "normals": direct.normals}
+        arrays |= {"share_starts": direct.starts, "share_texels": direct.texels, "shares": direct.shares}
     elif isinstance(direct, MeanCosine):
         arrays |= {"mean_cosine": direct.fixed}
     if isinstance(indirect, Indirect):
@@ -184,11 +190,16 @@ def _read(array: Any) -> NDArray[Any]:
 def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
     lighting = CubemapLighting(attributes["resolution"])
     _check_shapes(arrays, lighting)
-    direct: Visibility | MeanCosine | Interpolated
+    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated
     if attributes["basis"] == "direction":
         direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
         if "weights_direct_data" in arrays:
             direct = Interpolated(direct, _sparse_matrix("weights_direct", arrays, len(direct.bits)))
+    elif "shares" in arrays:
+        starts, texels, shares = _shares(arrays, lighting.n_directions)
+        direct = FractionalVisibility(
+            arrays["visibility"], starts, texels, shares, arrays["normals"], lighting
+        )
     else:
         direct = MeanCosine(arrays["mean_cosine"], lighting)
     return LightTransport(
@@ -202,6 +213,18 @@ def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Li
         scene_hash=attributes["scene_hash"],
         report=attributes["report"],
     )
+
+
+def _shares(
+    arrays: dict[str, NDArray[Any]], n_directions: int
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Lists of texels that are seen in part; nothing that uses them looks whether they make sense."""
+    starts, texels, shares = (arrays[name] for name in ("share_starts", "share_texels", "shares"))
+    matrix = scipy.sparse.csr_array((shares, texels, starts), shape=(len(starts) - 1, n_directions))
+    matrix.check_format(full_check=True)
+    if not matrix.has_canonical_format:
+        raise ValueError("texels that are seen in part are not in order")
+    return starts, texels, shares
 
 
 def _indirect(
@@ -233,6 +256,7 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
         "normals": (n_direct, 3),
         "visibility": (n_direct, -(-m // BITS)),
         "mean_cosine": (n, m),
+        "share_starts": (n + 1,),
         "indirect": (n_indirect, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
         "upsampling_indptr": (m + 1,),
         "weights_direct_indptr": (n + 1,),

@@ -12,6 +12,7 @@ import pytest
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, LightTransport, MeanCosine, MeshRange, Visibility
 from mi_sparse_prt.scene import Scene
 
@@ -27,6 +28,8 @@ FORMS = (
     "fixed point and full indirect",
     "bits and factored light",
     "fixed point and factored grey light",
+    "shares",
+    "shares and factored light",
 )
 
 
@@ -107,10 +110,16 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
     m = lighting.n_directions
     normals = rng.normal(size=(n_vertices, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    if form.startswith("bits"):
+    if form.startswith(("bits", "shares")):
         bits = rng.integers(0, 1 << 32, (n_vertices, -(-m // 32)), dtype=np.uint32)
         bits[:, -1] &= (1 << (m % 32)) - 1 if m % 32 else 0xFFFFFFFF
         direct = Visibility(bits, normals, lighting)
+        if form.startswith("shares"):
+            listed = rng.random((n_vertices, m)) < 0.1
+            starts = np.concatenate([[0], np.cumsum(listed.sum(axis=1))])
+            texels = np.nonzero(listed)[1].astype(np.uint16)
+            shares = rng.integers(0, 256, len(texels), dtype=np.uint8)
+            direct = FractionalVisibility(bits, starts, texels, shares, normals, lighting)
     else:
         direct = MeanCosine(rng.integers(0, 1 << 16, (n_vertices, m), dtype=np.uint16), lighting)
     indirect = None

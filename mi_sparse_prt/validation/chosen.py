@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import LightTransport, Visibility
 from mi_sparse_prt.sampling.bits import Bits
 from mi_sparse_prt.transport.direct import BITS
@@ -24,10 +25,8 @@ FEWEST_RAYS = 1 << 16  # ... but as many as this, or a quarter of the mesh
 FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
 AROUND = 24  # texels: 5 x 5 without the middle
 NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
-BELOW_HORIZON = (
-    0.25  # added to the cosine where direct light is not stored as bits: it may be wrong there, too
-)
-FEW = 8  # times fewer rays in that case: hardly an element is without an error
+BELOW_HORIZON = 0.25  # added to the cosine where direct light is not bits alone: it may be wrong there, too
+FEW = 8  # times fewer elements in that case: hardly one is without an error
 
 PATHS = 6144  # elements for indirect light, shared out among meshes; at most 1 / 16 of a mesh ...
 FEW_PATHS = 512  # ... and as many as this where there are many meshes
@@ -61,8 +60,8 @@ def for_direct_light(
 ) -> Chosen:
     """Draw elements for direct light, at all vertices of a mesh: a few of them may hold most of the error.
 
-    At each vertex texels are drawn by cosine and solid angle. A bit is seldom wrong where all around it agree, so
-    only some of those are kept.
+    At each vertex texels are drawn by cosine and solid angle. An element is seldom wrong where all bits around it
+    agree, so only some of those are kept.
 
     Parameters
     ----------
@@ -76,10 +75,13 @@ def for_direct_light(
     lighting, part = transport.lighting, transport.direct
     total = (inside.stop - inside.start) * lighting.n_directions
     rays = max(RAYS * total, min(total / 4, FEWEST_RAYS))
+    floor = 0.0
     if not isinstance(part, Visibility):
-        return _by_cosine(lighting, normals, inside, rays / FEW, BELOW_HORIZON, rng)
+        rays, floor = rays / FEW, BELOW_HORIZON
+    if not isinstance(part, Visibility | FractionalVisibility):
+        return _by_cosine(lighting, normals, inside, rays, floor, rng)
     drawn = rays / (NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES)
-    found = _by_cosine(lighting, normals, inside, drawn, 0.0, rng)
+    found = _by_cosine(lighting, normals, inside, drawn, floor, rng)
     nearest = min(AROUND + 1, lighting.n_directions)
     around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
     near = _near_edges(

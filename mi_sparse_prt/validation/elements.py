@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
 
@@ -14,7 +15,7 @@ BLOCK = (
 )  # elements at a time: an interpolated one has up to 40 dense ones, those four coarse ones each
 
 Ids = NDArray[np.integer]
-AnyPart = Visibility | MeanCosine | Indirect | Interpolated | Factored
+AnyPart = Visibility | FractionalVisibility | MeanCosine | Indirect | Interpolated | Factored
 
 
 def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
@@ -33,6 +34,8 @@ def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
     """
     if isinstance(part, Visibility):
         return _seen(part, ids, texels)
+    if isinstance(part, FractionalVisibility):
+        return part.elements(ids, texels)[:, None]
     if isinstance(part, MeanCosine):
         weights = part.lighting.solid_angles[texels] / np.float32(np.pi * FIXED_POINT)
         return (part.fixed[ids, texels] * weights)[:, None]

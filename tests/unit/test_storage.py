@@ -221,6 +221,44 @@ def test_a_file_of_a_newer_version(tmp_path, saved):
     assert_same(saved[0], prt.load_transport(untouched))  # the tool above does no damage by itself
 
 
+@pytest.mark.parametrize("form", [form for form in FORMS if not form.startswith("shares")])
+def test_files_of_the_version_before(tmp_path, form):
+    """Version 3 had no shares, and was as this one otherwise."""
+    transport = made_up(form)
+    transport.save(tmp_path / "a.prt")
+    old = rewritten(tmp_path / "a.prt", tmp_path / "b.prt", changed_attributes(version=3))
+    assert_same(transport, prt.load_transport(old))
+
+
+@pytest.mark.parametrize("what", ["starts", "length", "order", "range"])
+def test_lists_of_texels_that_make_no_sense(tmp_path, what):
+    transport = made_up("shares")
+    direct = transport.direct
+    starts, texels, shares = direct.starts.copy(), direct.texels.copy(), direct.shares
+    if what == "starts":
+        starts[3] = starts[5]
+    elif what == "length":
+        shares = shares[:-1]
+    elif what == "order":
+        texels[[starts[1], starts[1] + 1]] = texels[[starts[1] + 1, starts[1]]]
+    else:
+        texels[starts[2] - 1] = 96
+    damaged = replace(direct, starts=starts, texels=texels, shares=shares)
+    replace(transport, direct=damaged).save(tmp_path / "a.prt")
+    refused(tmp_path / "a.prt")
+
+
+def test_no_texel_seen_in_part(tmp_path):
+    """Lists of nothing."""
+    transport = made_up("shares")
+    direct = transport.direct
+    starts = np.zeros_like(direct.starts)
+    empty = replace(direct, starts=starts, texels=direct.texels[:0], shares=direct.shares[:0])
+    transport = replace(transport, direct=empty)
+    transport.save(tmp_path / "a.prt")
+    assert_same(transport, prt.load_transport(tmp_path / "a.prt"))
+
+
 def test_a_file_of_another_scene(saved, grey_scene):
     with pytest.raises(prt.PrtError, match="belongs to another scene"):
         prt.load_transport(saved[1], grey_scene)
