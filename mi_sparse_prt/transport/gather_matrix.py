@@ -23,9 +23,13 @@ FEW = 0.01  # such hits among all: inside of closed surfaces, where it is dark
 
 
 def gather_matrix(
-    scene: Scene, points: Points, rays_per_vertex: int, seed: int = 0
+    scene: Scene,
+    points: Points,
+    rays_per_vertex: int,
+    seed: int = 0,
+    nodes: NDArray[np.integer] | None = None,
 ) -> scipy.sparse.csr_array:
-    """G (n_v, n_v): what cosine-distributed rays from each vertex find, by the vertices of the triangles they hit.
+    """G (n, n_v): what cosine-distributed rays from some vertices find, by the vertices of the triangles they hit.
 
     Each ray names one corner of its triangle, by chance and with the barycentric weight as its probability. That is
     linear interpolation on average, for a third of the entries. A ray that meets nothing, or a surface from behind,
@@ -39,20 +43,22 @@ def gather_matrix(
     rays_per_vertex : int
         A power of two.
     seed : int
+    nodes : (n,) integers, optional
+        The vertices that have rows; all if not given.
 
     Returns
     -------
-    (n_v, n_v) sparse float32
+    (n, n_v) sparse float32
         Entries are multiples of 1 / rays_per_vertex.
     """
     if rays_per_vertex < 1 or rays_per_vertex & (rays_per_vertex - 1):
         raise PrtError(f"rays_per_vertex {rays_per_vertex} is not a power of two; use 64, 128, 256, ...")
     surfaces, arrays, samples = _Surfaces(scene), PointArrays(points), _sobol(rays_per_vertex)
+    starting = np.arange(len(points)) if nodes is None else nodes
     size = max(1, LANES // rays_per_vertex)
     blocks, met, behind = [], 0, 0
-    for a in range(0, len(points), size):
-        # a first row, whatever it is, is no literal: one kernel serves all blocks
-        ids = dr.arange(mi.UInt32, min(size, len(points) - a)) + dr.opaque(mi.UInt32, a)
+    for a in range(0, len(starting), size):
+        ids = mi.UInt32(starting[a : a + size].astype(np.uint32))
         hits = surfaces.seen_from(arrays, ids, samples, seed)
         met += int(np.count_nonzero(hits != NOTHING))
         behind += int(np.count_nonzero(hits == BEHIND))
@@ -61,7 +67,7 @@ def gather_matrix(
     counts, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32 if counts.sum() < NOTHING else np.int64)
     entries = values / np.float32(rays_per_vertex), columns, starts
-    return scipy.sparse.csr_array(entries, shape=(len(points), len(points)))
+    return scipy.sparse.csr_array(entries, shape=(len(starting), len(points)))
 
 
 class _Surfaces:

@@ -1,5 +1,7 @@
 """The gather matrix against geometry known in closed form, and the factored solution against plain linear algebra."""
 
+from dataclasses import dataclass
+
 import drjit as dr
 import numba
 import numpy as np
@@ -12,11 +14,15 @@ from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport import direct_columns as columns_module
+from mi_sparse_prt.transport import first_bounce as bounce_module
 from mi_sparse_prt.transport import gather as gather_module
 from mi_sparse_prt.transport import gather_matrix as matrix_module
+from mi_sparse_prt.transport import sparse_product as product_module
 from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.gather import GatherTransport, product
+from mi_sparse_prt.transport.gather import GatherTransport
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
+from mi_sparse_prt.transport.sparse_product import gathered, product
 
 WHITE = diffuse(1, 1, 1)
 ROOM = {"type": "cube", "flip_normals": True}
@@ -183,6 +189,18 @@ def test_product(width):
     assert product(matrix, dense[:, :0]).shape == (300, 0)
 
 
+def test_several_albedos_share_a_light(monkeypatch):
+    """Against dense products, in slabs of columns too."""
+    monkeypatch.setattr(product_module, "SLAB", 16)
+    rng = np.random.default_rng(0)
+    matrix = scipy.sparse.random_array((90, 70), density=0.2, rng=rng, dtype=np.float32).tocsr()
+    albedo = rng.random((3, 70), dtype=np.float32)
+    for width in (3, 16, 45):
+        light = rng.normal(size=(70, width)).astype(np.float32)
+        known = np.stack([matrix.toarray() @ (rho[:, None] * light) for rho in albedo])
+        assert np.abs(gathered(matrix, albedo, light) - known).max() < 1e-5
+
+
 def test_apply_is_the_neumann_series(coloured_scene, monkeypatch):
     direct = visibility(coloured_scene)
     columns = direct.columns(np.arange(96))[..., 0]
@@ -244,10 +262,9 @@ def direct_parts(scene: Scene) -> dict:
 def test_low_rank_and_rows_against_the_series(coloured_scene, kind, monkeypatch):
     """Full rank: equal. Tolerance 5%: the first bounce lacks the energy that is said.
 
-    3 channels of 8 random vectors know a norm within about 1 / sqrt(2 x 24) = 14%.
+    96 random combinations know a norm within about 1 / sqrt(2 x 96) = 7%.
     """
-    monkeypatch.setattr(gather_module, "SKETCH", 8)
-    monkeypatch.setattr(gather_module, "BLOCK", 96 * 100)
+    monkeypatch.setattr(columns_module, "BLOCK", 250 * 30)
     direct = direct_parts(coloured_scene)[kind]
     white = direct.columns(np.arange(96))[..., 0]
     gather = solver(coloured_scene, 4)
@@ -255,7 +272,7 @@ def test_low_rank_and_rows_against_the_series(coloured_scene, kind, monkeypatch)
     some = np.array([7, 200, 7, 250])
     assert relative(gather.rows(direct, some), known[some]) < 1e-5
     exact = gather.indirect(direct, tolerance=1e-6)
-    assert relative(exact.columns(np.arange(96)), known) < 2e-5
+    assert relative(exact.columns(np.arange(96)), known) < 3e-4
 
     first = solver(coloured_scene, 4, max_depth=3)
     few = first.indirect(direct, tolerance=0.05)
@@ -286,14 +303,51 @@ def test_parts_of_the_result_agree(coloured_scene):
 
 def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
     """A quarter of the texels, others for each block: the estimate is that of all of them."""
-    monkeypatch.setattr(gather_module, "SKETCH", 16)
-    monkeypatch.setattr(gather_module, "FEW_TEXELS", 96)
+    monkeypatch.setattr(bounce_module, "MIXED", 4)
     gather, direct = solver(coloured_scene, 8, max_depth=3), visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.1)
     known = gather.apply(direct.columns(np.arange(384))[..., 0])
     missing = relative(found.columns(np.arange(384)), known)
     assert max(found.ranks) < 70
     assert missing == pytest.approx(found.left_out, rel=0.25)
+
+
+@dataclass(frozen=True)
+class SomePart:
+    """A direct part of which only columns are known."""
+
+    part: Visibility
+
+    def columns(self, ids: np.ndarray) -> np.ndarray:
+        return self.part.columns(ids)
+
+    def relight(self, lighting: np.ndarray) -> np.ndarray:
+        return self.part.relight(lighting)
+
+
+def test_any_part_will_do(coloured_scene):
+    gather, direct = solver(coloured_scene, 4), visibility(coloured_scene)
+    known, found = (gather.indirect(part, tolerance=0.05) for part in (direct, SomePart(direct)))
+    assert found.ranks == known.ranks
+    assert relative(found.rows(np.arange(50)), known.rows(np.arange(50))) < 1e-3
+    some = np.array([3, 77])
+    assert relative(gather.rows(SomePart(direct), some), gather.rows(direct, some)) < 1e-5
+
+
+def test_least_squares_from_some_rows(monkeypatch):
+    """A basis made from sums of rows, and coefficients from a fifth of the rows, do not need them all.
+
+    Expected: the error that is said, within a third (it is measured on 96 combinations of a few columns each).
+    """
+    scene = build(0.15, **still_life(COLOURS))
+    gather, direct = solver(scene, 4, max_depth=3), visibility(scene)
+    monkeypatch.setattr(bounce_module, "FEW_ROWS", 16)
+    monkeypatch.setattr(bounce_module, "SUMS", 512)
+    found = gather.indirect(direct, tolerance=0.1)
+    known = gather.apply(direct.columns(np.arange(96))[..., 0])
+    assert scene.n_vertices > 1500
+    assert bounce_module.ROWS * sum(found.ranks) < scene.n_vertices / 2
+    assert relative(found.columns(np.arange(96)), known) == pytest.approx(found.left_out, rel=0.33)
 
 
 # ------------------------------------------------------------------------------------------ skipping
@@ -308,7 +362,9 @@ def test_one_channel_for_grey_scenes(grey_scene):
     assert len(result.left) == len(result.right) == 1
     assert result.relight(np.ones((96, 3), np.float32)).shape == (grey_scene.n_vertices, 3)
     known = neumann(gather, columns, grey_scene.albedo, 3)[..., :1]
-    assert relative(result.columns(np.arange(96)), known) < 0.01
+    assert (
+        relative(result.columns(np.arange(96)), known) < 0.013
+    )  # what is left out is estimated within a quarter
 
 
 @pytest.mark.parametrize("why", ["black", "alone", "direct only"])
@@ -318,7 +374,7 @@ def test_nothing_to_gather(why, monkeypatch):
     shapes |= {"ground": {"type": "rectangle", "bsdf": black}} if why == "direct only" else {}
     scene = build(**shapes)
     gather, direct = solver(scene, 4, max_depth=2 if why == "direct only" else 5), visibility(scene)
-    monkeypatch.setattr(gather_module._Columns, "combined", None)  # D is not touched
+    monkeypatch.setattr(columns_module.DirectColumns, "combined", None)  # D is not touched
     result = gather.indirect(direct)
     assert result.ranks == (0,)
     assert result.bounces == 0

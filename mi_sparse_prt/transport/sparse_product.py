@@ -1,0 +1,84 @@
+"""A sparse matrix times a dense one on all threads: what moves light between vertices."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+FEW = 8  # columns that are not worth a second thread
+SLAB = 512  # columns at a time: more of the dense matrix stays in the cache
+
+Floats = NDArray[np.float32]
+
+
+def product(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
+    """A sparse matrix (n, m) times a dense one (m, k), float32; the same for any number of threads."""
+    return gathered(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
+
+
+def gathered(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
+    """G rho x for several albedos rho and one light x, of which each row is read once for all of them.
+
+    Parameters
+    ----------
+    matrix : (n, m) sparse float32
+        G.
+    albedo : (channels, m) float32
+        The diagonals of rho.
+    light : (m, k) float32
+        x.
+
+    Returns
+    -------
+    (channels, n, k) float32
+        The same for any number of threads.
+    """
+    if light.shape[1] < FEW:
+        return np.stack([matrix @ (rho[:, None] * light) for rho in albedo])
+    shares = np.linspace(0, matrix.nnz, numba.get_num_threads() + 1)
+    bounds = np.searchsorted(matrix.indptr, shares)  # equal numbers of entries, not of rows
+    bounds[0], bounds[-1] = 0, matrix.shape[0]
+    result = np.empty((len(albedo), matrix.shape[0], light.shape[1]), np.float32)
+    for a in range(0, light.shape[1], SLAB):
+        part = slice(a, a + SLAB)
+        slab = np.ascontiguousarray(light[:, part], np.float32)
+        _gathered(bounds, matrix.indptr, matrix.indices, matrix.data, albedo, slab, result[:, :, part])
+    return result
+
+
+@numba.njit(parallel=True, fastmath={"contract"}, cache=True)
+def _gathered(
+    bounds: NDArray[np.int64],
+    starts: NDArray[np.int32],
+    columns: NDArray[np.int32],
+    values: Floats,
+    albedo: Floats,
+    light: Floats,
+    result: Floats,
+) -> None:
+    """Rows bounds[t] to bounds[t + 1] by thread t; four entries at a time, so that sums are stored less often."""
+    width = light.shape[1]
+    for t in numba.prange(len(bounds) - 1):
+        total = np.empty((len(albedo), width), np.float32)
+        for i in range(bounds[t], bounds[t + 1]):
+            total[:] = 0
+            end = starts[i + 1]
+            e = np.int64(starts[i])
+            while e + 4 <= end:
+                a, b, c, d = columns[e], columns[e + 1], columns[e + 2], columns[e + 3]
+                for h in range(len(albedo)):
+                    p, q = values[e] * albedo[h, a], values[e + 1] * albedo[h, b]
+                    r, s = values[e + 2] * albedo[h, c], values[e + 3] * albedo[h, d]
+                    for k in range(width):
+                        total[h, k] += p * light[a, k] + q * light[b, k] + r * light[c, k] + s * light[d, k]
+                e += 4
+            while e < end:
+                a = columns[e]
+                for h in range(len(albedo)):
+                    p = values[e] * albedo[h, a]
+                    for k in range(width):
+                        total[h, k] += p * light[a, k]
+                e += 1
+            result[:, i] = total

@@ -1,0 +1,94 @@
+"""Nodes: where light is gathered, if not at every vertex, and how the others follow."""
+
+import numpy as np
+import pytest
+from conftest import COLOURS, build, still_life
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport import gather_nodes
+from mi_sparse_prt.transport.gather import GatherTransport
+from mi_sparse_prt.transport.gather_nodes import choose_nodes
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return build(0.12, **still_life(COLOURS))
+
+
+@pytest.fixture(autouse=True)
+def _few(monkeypatch) -> None:
+    monkeypatch.setattr(gather_nodes, "SMALL", 200)
+
+
+def test_small_meshes_keep_all_vertices(scene):
+    points = vertex_points(scene)
+    assert choose_nodes(scene, points, scene.n_vertices).weights is None
+    nodes = choose_nodes(scene, points, 1000)
+    assert 900 < len(nodes) < 1100
+    for mesh in scene.meshes:
+        size = mesh.vertices.stop - mesh.vertices.start
+        kept = np.sum((nodes.ids >= mesh.vertices.start) & (nodes.ids < mesh.vertices.stop))
+        assert kept == size if size <= 200 else 200 <= kept < size
+
+
+def test_nodes_are_spread_evenly(scene):
+    """On the flat ground no place is farther from a node than four times the spacing of a square grid of so many."""
+    nodes = choose_nodes(scene, vertex_points(scene), 700)
+    ground = scene.meshes[0].vertices
+    p = scene.positions[ground][:, [0, 2]]
+    at = scene.positions[nodes.ids[nodes.ids < ground.stop]][:, [0, 2]]
+    nearest = np.linalg.norm(p[:, None] - at[None], axis=2).min(axis=1)
+    assert nearest.max() < 4 * 3 / np.sqrt(len(at)) / 2
+
+
+def test_constants_and_linear_functions_are_kept(scene):
+    """Rows of weights sum to 1; inside of the flat ground, positions are met within a tenth of a node's spacing."""
+    nodes = choose_nodes(scene, vertex_points(scene), 1000)
+    one = np.ones((len(nodes), 1), np.float32)
+    assert np.abs(nodes.spread(one) - 1).max() < 1e-5
+    spread = nodes.spread(scene.positions[nodes.ids])
+    ground = scene.meshes[0].vertices
+    inside = (np.abs(scene.positions[ground][:, [0, 2]]) < 1.2).all(axis=1)
+    error = (spread - scene.positions)[ground][inside]
+    spacing = 3 / np.sqrt(np.sum(nodes.ids < ground.stop))
+    assert np.sqrt((error**2).mean()) < 0.1 * spacing
+
+
+def test_collect_is_the_transpose_of_spread(scene):
+    nodes = choose_nodes(scene, vertex_points(scene), 800)
+    rng = np.random.default_rng(0)
+    light = rng.normal(size=(len(nodes), 9)).astype(np.float32)
+    weights = rng.normal(size=(scene.n_vertices, 9)).astype(np.float32)
+    left, right = np.vdot(weights, nodes.spread(light)), np.vdot(nodes.collect(weights), light)
+    assert left == pytest.approx(right, rel=1e-4)
+
+
+def test_the_result_does_not_depend_on_the_order_of_shapes(scene):
+    """The same nodes, and the same light at every vertex within rounding."""
+    lighting = prt.CubemapLighting(2)
+
+    def found(some: Scene) -> tuple[np.ndarray, np.ndarray]:
+        points = vertex_points(some)
+        order = np.argsort(points.keys)
+        gather = GatherTransport(some, lighting, points, 64, most_nodes=800)
+        light = np.maximum(some.normals[:, 1:2], 0)
+        return np.sort(points.keys[gather.nodes.ids]), gather.apply(light)[order, 0]
+
+    backwards = build(0.12, **dict(reversed(still_life(COLOURS).items())))
+    (nodes, light), (other_nodes, other_light) = found(scene), found(backwards)
+    assert np.array_equal(nodes, other_nodes)
+    assert light.max() > 0.05
+    assert np.abs(light - other_light).max() < 1e-5
+
+
+def test_fewer_nodes_fewer_rays_and_nearly_the_same_light(scene):
+    """A quarter of the vertices of the larger meshes: indirect light within 8% of that of all, the mean within 1%."""
+    points, lighting = vertex_points(scene), prt.CubemapLighting(2)
+    light = np.maximum(0.5 + 0.5 * scene.normals[:, 1:2], 0)
+    every, some = (GatherTransport(scene, lighting, points, 256, most_nodes=most) for most in (10**6, 800))
+    assert some.rays == 256 * len(some.nodes) < 0.6 * every.rays
+    known, found = every.apply(light), some.apply(light)
+    assert np.linalg.norm(found - known) < 0.08 * np.linalg.norm(known)
+    assert found.mean() == pytest.approx(known.mean(), rel=0.01)
