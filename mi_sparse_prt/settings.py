@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.planner.plan import BY_NAME, Plan
 
-METHODS = ("brute_force", "sparse", "huang2010", "gather")
+METHODS = ("auto", *BY_NAME)
 BASES = ("direction", "texel")
+SPP = 16
 
 
 @dataclass(frozen=True)
@@ -22,35 +24,30 @@ class Settings:
     """
 
     resolution: int
-    method: str = "brute_force"
+    method: str | Plan = "auto"
     basis: str = "direction"
     max_depth: int = 5
-    spp: int = 16
+    spp: int | None = None
     target_error: float | None = None
     seed: int = 0
     indirect_resolution: int | None = None
     strata: int = 2
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
+        if isinstance(self.method, str) and self.method not in METHODS:
             raise PrtError(f"unknown method {self.method!r}; choose one of: {', '.join(METHODS)}")
-        if self.method != "brute_force":
-            if self.basis != "direction" and self.method != "gather":
-                raise PrtError(f'method {self.method!r} works in the direction basis; set basis="direction"')
-            if self.indirect_resolution not in (None, self.resolution):
-                raise PrtError(
-                    f"method {self.method!r} chooses the directions of the indirect light itself; "
-                    "leave indirect_resolution out"
-                )
-            if self.target_error is not None and self.method == "huang2010":
-                raise PrtError(
-                    'method "huang2010" has the rates of the paper and aims at no target error; leave it out, '
-                    'or set method="sparse"'
-                )
+        if self.plan is not None:
+            self._check_plan(self.plan)
+        if self.target_error is not None and self.method == "huang2010":
+            raise PrtError(
+                'method "huang2010" has the rates of the paper and aims at no target error; leave it out, '
+                'or set method="sparse"'
+            )
         if self.basis not in BASES:
             raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")
-        for name, least in (("spp", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):
+        for name, least in (("samples", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):
             value = getattr(self, name)
+            name = "spp" if name == "samples" else name
             if value != int(value) or value < least:
                 raise PrtError(f"{name} is {value}; it must be a whole number of at least {least}")
         if self.max_depth < 2 and self.max_depth != -1:
@@ -62,6 +59,31 @@ class Settings:
                 f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
                 f"use at most {self.resolution}"
             )
+
+    def _check_plan(self, plan: Plan) -> None:
+        name = self.method if isinstance(self.method, str) else "Plan"
+        basis = {"exact": self.basis, "edges": "texel"}.get(plan.direct, "direction")
+        if self.basis != basis:
+            raise PrtError(f'method {name!r} works in the {basis} basis; set basis="{basis}"')
+        if plan.indirect != "paths" and self.indirect_resolution not in (None, self.resolution):
+            raise PrtError(
+                f"method {name!r} chooses the directions of the indirect light itself; leave indirect_resolution out"
+            )
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan that the method stands for, None if it is to be chosen."""
+        return self.method if isinstance(self.method, Plan) else BY_NAME.get(self.method)
+
+    def of(self, plan: Plan) -> Settings:
+        """These, with the samples and the resolution of the indirect light that a plan has."""
+        resolution = (plan.resolution or self.indirect_resolution) if plan.indirect == "paths" else None
+        return replace(self, spp=plan.spp or self.samples, indirect_resolution=resolution)
+
+    @property
+    def samples(self) -> int:
+        """Paths per element, where nothing else says how many."""
+        return SPP if self.spp is None else self.spp
 
     @property
     def coarse(self) -> CubemapLighting:

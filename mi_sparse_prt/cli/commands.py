@@ -18,6 +18,7 @@ from mi_sparse_prt.cli.tables import (
     choices_tables,
     matrix_tables,
     methods_tables,
+    plan_tables,
     relighting_table,
     scene_report,
     scene_tables,
@@ -117,6 +118,7 @@ Variant = Annotated[
 class Method(StrEnum):
     """Which elements are evaluated."""
 
+    auto = "auto"
     brute_force = "brute_force"
     sparse = "sparse"
     huang2010 = "huang2010"
@@ -142,10 +144,11 @@ def precompute(
     method: Annotated[
         Method,
         typer.Option(
-            help="Evaluate every element, few of them (sparse), few as in the paper (huang2010), or all direct "
-            "light, and interreflections by finite elements (gather)."
+            help="What is quickest for the target error, by a pilot on a few hundred vertices (auto); or every "
+            "element, few of them (sparse), few as in the paper (huang2010), or all direct light, and "
+            "interreflections by finite elements (gather)."
         ),
-    ] = Method.brute_force,
+    ] = Method.auto,
     basis: Annotated[
         Basis, typer.Option(help="Light from a texel's centre alone, or from its whole area.")
     ] = Basis.direction,
@@ -155,24 +158,35 @@ def precompute(
             help="As Mitsuba's path: 2 is direct light only, 5 three interreflections, -1 no limit."
         ),
     ] = 5,
-    spp: Annotated[int, typer.Option(help="Paths per element of the indirect light.")] = 16,
+    spp: Annotated[
+        int | None,
+        typer.Option(
+            help="Paths per element of the indirect light, where there are any; auto then chooses no other number.",
+            show_default="16, or what the target error needs",
+        ),
+    ] = None,
     indirect_resolution: Annotated[
         int | None,
         typer.Option(
-            help="Texels along an edge of the indirect light's cubemap: its cost grows with the square. "
-            "The report says what a coarse one costs in error.",
-            show_default="8, or the resolution",
+            help="Texels along an edge of the indirect light's cubemap, where it is path traced: its cost grows "
+            "with the square. The report says what a coarse one costs in error. auto then chooses no other one.",
+            show_default="brute_force: 8, or the resolution",
         ),
     ] = None,
     target_error: Annotated[
         float | None,
         typer.Option(
             metavar="ERROR",
-            help="Relative L2 error of the matrix to aim at, 0.02 for 2%: a pilot then chooses --spp and "
-            "--indirect-resolution.",
-            show_default=False,
+            help="Relative L2 error of the matrix to aim at, 0.02 for 2%. Elements held out say whether it was met; "
+            "if not, auto, sparse and gather try again, finer. brute_force chooses --spp and "
+            "--indirect-resolution for it.",
+            show_default="auto: 0.02, and one try",
         ),
     ] = None,
+    explain: Annotated[
+        bool,
+        typer.Option("--explain", help="Show all plans that auto compared, with predicted time and error."),
+    ] = False,
     strata: Annotated[
         int, typer.Option(help="With --basis texel: shadow rays per element are the square of this.")
     ] = 2,
@@ -196,7 +210,7 @@ def precompute(
     Example: mi-sparse-prt precompute scenes_xml/bunny.xml -o bunny.prt
 
     A forecast of time and memory comes first; a table of what was done, skipped and how good it is comes last.
-    Direct light only, in seconds: add --max-depth 2.
+    Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain.
     """
     with running(json_file, quiet, outputs=[output]) as command:
         parameters = _definitions(define)
@@ -205,7 +219,7 @@ def precompute(
             check_folder(checkpoint)
             command.hint = f"; finished rows are in {checkpoint}, the same command goes on with them"
         coarse = indirect_resolution
-        if coarse is None and method is Method.brute_force:
+        if coarse is None and method is Method.brute_force and target_error is None:
             coarse = min(8, resolution)
         with command.prompt_interrupts():
             transport = prt.precompute(
@@ -231,7 +245,7 @@ def precompute(
         transport.save(output)
         command.written.append(output)
         command.report = transport.report | {"file": {"path": str(output), "bytes": output.stat().st_size}}
-        command.show(*matrix_tables(transport, output))
+        command.show(*(plan_tables(transport) if explain else []), *matrix_tables(transport, output))
 
 
 @app.command()

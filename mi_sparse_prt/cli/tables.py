@@ -33,7 +33,12 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
     done.add_row("matrix in memory", _bytes(transport.nbytes))
     done.add_row("file", _bytes(path.stat().st_size))
     done.add_row("peak memory", _bytes(report["peak_memory_bytes"]))
-    for name in ("max_depth", "spp", "indirect_resolution", "strata", "seed"):
+    paths: tuple[str, ...] = ("spp", "indirect_resolution")
+    if "plan" in report:
+        plan, paths = report["plan"], ()
+        done.add_row("direct light", plan["direct"])
+        done.add_row("indirect light", _indirect(plan))
+    for name in ("max_depth", *paths, "strata", "seed"):
         done.add_row(name, str(report["parameters"][name]))
     for name in ("path", "hash"):
         done.add_row(f"scene {name}", str(report["scene"][name]))
@@ -69,6 +74,32 @@ def matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
         if sentences:
             tables.append(_sentences(title, sentences))
     return tables
+
+
+def plan_tables(transport: LightTransport) -> list[Table]:
+    """The plans that were compared, and next to the one that was carried out, what came of it; none, no table."""
+    report = transport.report
+    if not report["plans"]:
+        return []
+    table = _table("Plans", "direct light", "indirect light", "time", "error", "")
+    for plan in report["plans"]:
+        table.add_row(
+            plan["direct"],
+            _indirect(plan),
+            _duration(plan["predicted_seconds"]),
+            _share(plan["predicted_error"]),
+            "chosen" if plan["chosen"] else "",
+        )
+    table.add_section()
+    taken, error = report["seconds"]["total"], report["estimated_error"]["total"]
+    table.add_row("result", "", _duration(taken), _share(error), "")
+    return [table]
+
+
+def _indirect(plan: dict[str, Any]) -> str:
+    """How a plan finds indirect light: "gather rays 64 tolerance 0.06"."""
+    numbers = (f"{name} {value:g}" for name, value in plan["parameters"].items() if value is not None)
+    return " ".join([plan["indirect"], *numbers])
 
 
 def _sentences(title: str, sentences: list[str]) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 
 
@@ -27,7 +28,7 @@ class Parts:
         Of methods that leave elements out: per mesh, how many vertices and directions were taken.
     """
 
-    direct: Visibility | MeanCosine | Interpolated
+    direct: Visibility | MeanCosine | FractionalVisibility | Interpolated
     indirect: Indirect | Interpolated | Factored | None
     elements_evaluated: int
     elements: dict[str, int]

@@ -28,7 +28,7 @@ class SparsePRT(mi.SamplingIntegrator):
         <integrator type="sparse_prt">
             <integer name="resolution" value="32"/>
             <integer name="max_depth" value="5"/>
-            <integer name="indirect_resolution" value="8"/>
+            <float name="target_error" value="0.02"/>
             <boolean name="reference" value="false"/>
             <integrator type="path"><integer name="max_depth" value="5"/></integrator>
         </integrator>
@@ -41,12 +41,13 @@ class SparsePRT(mi.SamplingIntegrator):
     Parameter           Type       Meaning
     =================== ========== =============================================================================
     resolution          integer    Texels along an edge of the lighting's cubemap, a power of two. (32)
-    method              string     As for ``prt.precompute``. (brute_force)
+    method              string     As for ``prt.precompute``. (auto)
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
-    precompute_spp      integer    Paths per indirect element. (16)
-    indirect_resolution integer    Texels along an edge of the indirect light's cubemap. (8, or ``resolution``)
-    target_error        float      Relative L2 error of the matrix to aim at; sets the two above. (0: none)
+    precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16)
+    indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
+                                   chooses; of ``brute_force`` 8, or ``resolution``)
+    target_error        float      Relative L2 error of the matrix to aim at. (0: that of ``prt.precompute``)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
@@ -60,13 +61,14 @@ class SparsePRT(mi.SamplingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self._lighting = CubemapLighting(props.get("resolution", 32))
-        coarse = min(8, self._lighting.resolution)
+        method = props.get("method", "auto")
+        coarse = min(8, self._lighting.resolution) if method == "brute_force" else 0
         self._settings = {
-            "method": props.get("method", "brute_force"),
+            "method": method,
             "basis": props.get("basis", "texel"),
             "max_depth": props.get("max_depth", 5),
-            "spp": props.get("precompute_spp", 16),
-            "indirect_resolution": props.get("indirect_resolution", coarse),
+            "spp": props.get("precompute_spp") if props.has_property("precompute_spp") else None,
+            "indirect_resolution": props.get("indirect_resolution", coarse) or None,
             "target_error": props.get("target_error", 0.0) or None,
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),

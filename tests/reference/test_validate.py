@@ -103,7 +103,11 @@ def scene() -> prt.Scene:
 
 
 def precomputed(scene: prt.Scene, **parameters: object) -> LightTransport:
-    return prt.precompute(scene, LIGHTING, **({"spp": 64, "max_depth": 4, "progress": False} | parameters))
+    return prt.precompute(
+        scene,
+        LIGHTING,
+        **({"method": "brute_force", "spp": 64, "max_depth": 4, "progress": False} | parameters),
+    )
 
 
 def validated(scene: prt.Scene, transport: LightTransport, **parameters: object) -> prt.Validation:
@@ -280,7 +284,14 @@ def test_scenes(path):
     scene = prt.load_scene(path, edge_length=edge_length, width=160, height=120)
     lighting = prt.CubemapLighting(8)
     transport = prt.precompute(
-        scene, lighting, basis="texel", spp=16, strata=3, indirect_resolution=4, progress=False
+        scene,
+        lighting,
+        method="brute_force",
+        basis="texel",
+        spp=16,
+        strata=3,
+        indirect_resolution=4,
+        progress=False,
     )
     validation = prt.validate(
         scene, transport, n_rows=300, n_columns=96, spp=256, image_width=160, image_spp=1024, progress=False

@@ -67,7 +67,9 @@ def test_a_convex_object_alone(kind, artefact):
         vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True) * [1, 0.5, 0.7]
         shape = mesh("ellipsoid", vertices, triangles, diffuse(*albedo))
     scene = build(0.5, shape=shape)
-    transport = prt.precompute(scene, prt.CubemapLighting(16), basis="texel", strata=4, progress=False)
+    transport = prt.precompute(
+        scene, prt.CubemapLighting(16), method="brute_force", basis="texel", strata=4, progress=False
+    )
     error = transport.relight(1.0) / albedo - 1
     print(f"{kind}: worst vertex {np.abs(error).max():.1e}, mean {error.mean():+.1e}")
     assert np.abs(error).max() < 1e-3
@@ -238,7 +240,9 @@ def test_a_cap_of_light_over_a_plane(angle, artefact):
         cosine = np.maximum(directions[..., 1], 0)
         cut = (share > 0) & (share < 1)
         bounds.append(float(((np.ptp(cosine, axis=1) * lighting.solid_angles)[cut]).sum() / np.pi))
-        transport = prt.precompute(scene, lighting, basis="texel", max_depth=2, strata=4, progress=False)
+        transport = prt.precompute(
+            scene, lighting, method="brute_force", basis="texel", max_depth=2, strata=4, progress=False
+        )
         L = np.repeat(share[:, None], 3, axis=1).astype(np.float32)
         errors.append(np.abs(transport.irradiance(L)[:, 0] - known).max())
     print(f"{angle} degrees: errors {np.round(errors, 5)}, bounds {np.round(bounds, 5)}")

@@ -27,7 +27,7 @@ def gathered(scene: prt.Scene) -> prt.LightTransport:
 
 
 def test_direct_light_is_that_of_brute_force(scene, gathered):
-    exact = prt.precompute(scene, LIGHTING, max_depth=2, progress=False)
+    exact = prt.precompute(scene, LIGHTING, method="brute_force", max_depth=2, progress=False)
     assert np.array_equal(gathered.direct.bits, exact.direct.bits)
 
 

@@ -162,7 +162,9 @@ def test_quarter_turn(grey_scene, artefact):
 
 def rows_by_key(scene: prt.Scene, basis: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a whole precomputation sorted by the keys of their vertices, and the keys."""
-    transport = prt.precompute(scene, COARSE, basis=basis, spp=4, seed=7, progress=False)
+    transport = prt.precompute(
+        scene, COARSE, method="brute_force", basis=basis, spp=4, seed=7, progress=False
+    )
     order = np.argsort(transport.vertex_keys)
     return transport.rows(order), transport.vertex_keys[order]
 
@@ -267,10 +269,10 @@ def test_block_size(coloured_scene, basis, monkeypatch, artefact):
 
     Result: they are.
     """
-    whole = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
+    whole = prt.precompute(coloured_scene, COARSE, method="brute_force", basis=basis, spp=4, progress=False)
     monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 1 << 12)
     monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 1 << 14)
-    parts = prt.precompute(coloured_scene, COARSE, basis=basis, spp=4, progress=False)
+    parts = prt.precompute(coloured_scene, COARSE, method="brute_force", basis=basis, spp=4, progress=False)
     ids = np.arange(coloured_scene.n_vertices)
     a, b = whole.rows(ids), parts.rows(ids)
     artefact(draw((a - b).reshape(len(a), -1), a.reshape(len(a), -1)))
@@ -287,11 +289,13 @@ def test_number_of_threads(coloured_scene, artefact):
 
     Result: they are.
     """
-    many = prt.precompute(coloured_scene, COARSE, basis="texel", spp=4, progress=False)
+    many = prt.precompute(coloured_scene, COARSE, method="brute_force", basis="texel", spp=4, progress=False)
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
-        one = prt.precompute(coloured_scene, COARSE, basis="texel", spp=4, progress=False)
+        one = prt.precompute(
+            coloured_scene, COARSE, method="brute_force", basis="texel", spp=4, progress=False
+        )
     finally:
         dr.set_thread_count(threads)
     ids = np.arange(coloured_scene.n_vertices)

@@ -36,7 +36,9 @@ def few_held_out_paths(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def precompute(scene: prt.Scene, **parameters: object) -> prt.LightTransport:
-    return prt.precompute(scene, COARSE, **({"spp": 2, "progress": False} | parameters))
+    return prt.precompute(
+        scene, COARSE, **({"method": "brute_force", "spp": 2, "progress": False} | parameters)
+    )
 
 
 # ------------------------------------------------------------------------------------ counting

@@ -40,7 +40,7 @@ def rows(transport: LightTransport) -> NDArray[np.float64]:
 
 @cache
 def brute_force(kind: str) -> NDArray[np.float64]:
-    return rows(prt.precompute(scene(kind), LIGHTING, max_depth=2, progress=False))
+    return rows(prt.precompute(scene(kind), LIGHTING, method="brute_force", max_depth=2, progress=False))
 
 
 @cache
@@ -77,7 +77,10 @@ def test_a_power_of_two_leaves_visibility(power):
     Expected: at most one bit in 10000 of all visibility differs.
     """
     there = build(EDGE * 2.0**power, **still_life(place=T().scale(2.0**power)))
-    a, b = (prt.precompute(s, LIGHTING, max_depth=2, progress=False) for s in (scene("home"), there))
+    a, b = (
+        prt.precompute(s, LIGHTING, method="brute_force", max_depth=2, progress=False)
+        for s in (scene("home"), there)
+    )
     assert (unpack(a.direct.bits ^ b.direct.bits, LIGHTING.n_directions)).mean() < 1e-4
 
 

@@ -89,7 +89,7 @@ class Counter:
             return found
 
         monkeypatch.setattr(pipeline, "held_out_error", uncounted)
-        monkeypatch.setattr(pipeline, "_seconds_per_row", lambda _: 0.0)
+        monkeypatch.setattr("mi_sparse_prt.planner.forecast.seconds_per_row", lambda _: 0.0)
         monkeypatch.setattr(DirectTransport, "visible", counted_visible)
         monkeypatch.setattr(PathTransport, "elements", counted_indirect)
 

@@ -127,6 +127,7 @@ def test_kinds_of_environments(folder, kind, artefact):
     transport = prt.precompute(
         surfaces,
         prt.CubemapLighting(8),
+        method="brute_force",
         basis="texel",
         max_depth=4,
         spp=16,

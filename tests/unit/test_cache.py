@@ -10,7 +10,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt import cache
 
 LIGHTING = prt.CubemapLighting(2)
-SETTINGS = {"spp": 2, "max_depth": 3}
+SETTINGS = {"method": "brute_force", "spp": 2, "max_depth": 3}
 SAME = ((0.5,) * 3,) * 3  # one material for all shapes, so that Mitsuba merges what it can
 
 

@@ -35,7 +35,7 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 VERTICES = 4 + 24
-PRECOMPUTE = ["--resolution", "4", "--spp", "2", "--edge-length", "inf"]
+PRECOMPUTE = ["--method", "brute_force", "--resolution", "4", "--spp", "2", "--edge-length", "inf"]
 
 
 def call(*arguments: object):
@@ -101,6 +101,7 @@ def test_precompute_writes_matrix_and_report(folder, matrix):
     expected = prt.precompute(
         prt.load_scene(folder / "scene.xml", float("inf")),
         prt.CubemapLighting(4),
+        "brute_force",
         spp=2,
         indirect_resolution=4,
         progress=False,
@@ -154,7 +155,7 @@ def test_json_on_stdout_is_alone_there(folder, scene):
 
 
 def test_target_error_is_passed_on(folder, scene):
-    """Expected: the pilot's plans are in the report, and the parameters are those of the first."""
+    """Expected: the pilot's plans are in the report, and the parameters are those of the chosen one."""
     result = call(
         "precompute",
         scene,
@@ -169,8 +170,25 @@ def test_target_error_is_passed_on(folder, scene):
     assert result.exit_code == 0
     report = json.loads((folder / "t.json").read_text())
     assert report["parameters"]["target_error"] == 0.2
-    assert report["parameters"]["spp"] == report["plans"][0]["spp"]
+    (chosen,) = (plan for plan in report["plans"] if plan["chosen"])
+    assert report["parameters"]["spp"] == chosen["parameters"]["spp"]
     assert "target" in result.stdout
+
+
+def test_a_plan_is_chosen_and_explained(folder, scene):
+    """Without a method: all plans that were compared are in the table and in the report."""
+    report = folder / "auto.json"
+    arguments = ("--resolution", 4, "--edge-length", "inf", "--explain", "--json", report)
+    result = call("precompute", scene, "-o", folder / "auto.prt", *arguments)
+    assert result.exit_code == 0, result.stderr
+    plans = json.loads(report.read_text())["plans"]
+    assert sum(plan["chosen"] for plan in plans) == 1
+    table = result.stdout[result.stdout.index("Plans") : result.stdout.index("result")]
+    assert table.count("chosen") == 1
+    for kind in ("exact", "consensus", "gather rays 64 tolerance 0.06", "paths resolution 4"):
+        assert kind in table
+    silent = call("precompute", scene, "-o", folder / "auto.prt", *PRECOMPUTE, "--max-depth", 2)
+    assert "Plans" not in silent.stdout
 
 
 def test_definitions_reach_the_scene(folder, scene):

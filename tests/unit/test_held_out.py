@@ -26,7 +26,16 @@ SEEDS = range(6)
 def converged(scene: prt.Scene, basis: str) -> list[np.ndarray]:
     """The whole matrix twice, independently, at 128 samples per element."""
     return [
-        prt.precompute(scene, LIGHTING, basis=basis, spp=128, strata=6, seed=1000 + k, progress=False)
+        prt.precompute(
+            scene,
+            LIGHTING,
+            method="brute_force",
+            basis=basis,
+            spp=128,
+            strata=6,
+            seed=1000 + k,
+            progress=False,
+        )
         .rows(np.arange(scene.n_vertices))
         .astype(np.float64)
         for k in (0, 1)
@@ -57,7 +66,9 @@ def estimates(report: dict) -> tuple[dict[str, float], dict[str, float]]:
 def exact() -> tuple[prt.Scene, LightTransport]:
     """Direct light of a tiny scene at 1536 directions, by brute force."""
     scene = build(**still_life())
-    transport = prt.precompute(scene, prt.CubemapLighting(16), max_depth=2, progress=False)
+    transport = prt.precompute(
+        scene, prt.CubemapLighting(16), method="brute_force", max_depth=2, progress=False
+    )
     return scene, transport
 
 
@@ -94,7 +105,14 @@ def test_the_estimate_covers_the_true_error(grey_scene, basis, coarse):
     deviations, widths, ratios = [], [], []
     for seed in SEEDS:
         transport = prt.precompute(
-            grey_scene, LIGHTING, basis=basis, spp=8, seed=seed, indirect_resolution=coarse, progress=False
+            grey_scene,
+            LIGHTING,
+            method="brute_force",
+            basis=basis,
+            spp=8,
+            seed=seed,
+            indirect_resolution=coarse,
+            progress=False,
         )
         true = errors_of(grey_scene, transport, truth)
         found, errors = estimates(transport.report["estimated_error"])
@@ -278,7 +296,7 @@ def test_a_black_mesh_has_no_error():
 def test_a_black_mesh_among_others():
     """The ball is black: it has no error, and adds none to the total."""
     dark = build(**still_life(((0.5,) * 3, (0.0,) * 3, (0.7,) * 3)))
-    transport = prt.precompute(dark, LIGHTING, spp=4, progress=False)
+    transport = prt.precompute(dark, LIGHTING, method="brute_force", spp=4, progress=False)
     reported = transport.report["estimated_error"]
     assert reported["meshes"]["ball"] == reported["standard_error"]["meshes"]["ball"] == 0
     assert 0 < reported["total"] < 1
@@ -294,7 +312,9 @@ def test_meshes_of_three_vertices(basis):
         low=mesh_of("low", corners, one, grey),
         high=mesh_of("high", corners + [0.1, 0.4, 0.1], one[:, ::-1], grey),
     )
-    transport = prt.precompute(scene, prt.CubemapLighting(2), basis=basis, spp=4, progress=False)
+    transport = prt.precompute(
+        scene, prt.CubemapLighting(2), method="brute_force", basis=basis, spp=4, progress=False
+    )
     reported = transport.report["estimated_error"]
     assert np.isfinite([*estimates(reported)[0].values(), *estimates(reported)[1].values()]).all()
     assert 0 < reported["elements"] <= 6 * 24

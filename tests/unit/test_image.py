@@ -116,7 +116,7 @@ def scene() -> prt.Scene:
 
 @pytest.fixture(scope="module")
 def transport(scene: prt.Scene) -> prt.LightTransport:
-    return prt.precompute(scene, LIGHTING, max_depth=2, progress=False)
+    return prt.precompute(scene, LIGHTING, method="brute_force", max_depth=2, progress=False)
 
 
 def test_an_image_is_the_relit_vertices(scene, transport):

@@ -28,7 +28,7 @@ def test_the_choice_of_elements(grey_scene):
 def test_the_squared_error_of_a_matrix(grey_scene):
     """A direct matrix 10% too bright: exactly, a hundredth of the squared norm."""
     held = PilotElements(grey_scene, LIGHTING, "direction", 2, False, seed=0)
-    transport = prt.precompute(grey_scene, LIGHTING, max_depth=2, progress=False)
+    transport = prt.precompute(grey_scene, LIGHTING, "brute_force", max_depth=2, progress=False)
     ours = 1.1 * transport.rows(held.vertices)
     squares = held.squared_error(np.take_along_axis(ours, held.texels[..., None], axis=1))
     assert held.relative_square(squares) == pytest.approx(0.01, rel=1e-3)

@@ -1,6 +1,5 @@
 """The pipeline: its report, what it skips, what it refuses, and that a seed decides all."""
 
-import importlib
 import json
 
 import numpy as np
@@ -16,7 +15,9 @@ LIGHTING = prt.CubemapLighting(4)
 
 
 def precompute(scene: prt.Scene, **parameters: object) -> LightTransport:
-    return prt.precompute(scene, LIGHTING, **({"spp": 4, "progress": False} | parameters))
+    """Every element, if not told otherwise."""
+    usual = {"method": "brute_force", "spp": 4, "progress": False}
+    return prt.precompute(scene, LIGHTING, **(usual | parameters))
 
 
 @pytest.fixture
@@ -89,9 +90,9 @@ def test_the_forecast_of_few_elements(grey_scene, monkeypatch, capsys, method, e
     Expected: about that share of the time of brute force. Of so small a matrix weights are a large part, which the
     forecast of its size does not know.
     """
-    pipeline = importlib.import_module("mi_sparse_prt.precompute")  # the package's own is the function
     monkeypatch.setattr(
-        pipeline, "_seconds_per_row", lambda s: 10.0 if isinstance(s, PathTransport) else 0.01
+        "mi_sparse_prt.planner.forecast.seconds_per_row",
+        lambda solver: 10.0 if isinstance(solver, PathTransport) else 0.01,
     )
     transport = precompute(grey_scene, method=method, progress=True)
     forecast = transport.report["forecast"]

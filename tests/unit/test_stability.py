@@ -379,4 +379,6 @@ def test_a_texel_of_a_bitmap_that_is_nan():
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}
     with pytest.raises(prt.PrtError, match="vertex"):
         scene = with_ground({"type": "diffuse", "reflectance": texture})
-        prt.precompute(scene, prt.CubemapLighting(4), max_depth=3, spp=64, progress=False)
+        prt.precompute(
+            scene, prt.CubemapLighting(4), method="brute_force", max_depth=3, spp=64, progress=False
+        )

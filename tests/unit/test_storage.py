@@ -94,7 +94,7 @@ def test_a_dark_matrix(tmp_path):
 
 def test_the_report_of_a_precomputation_comes_back(tmp_path, grey_scene):
     lighting = prt.CubemapLighting(2)
-    transport = prt.precompute(grey_scene, lighting, spp=2, progress=False)
+    transport = prt.precompute(grey_scene, lighting, method="brute_force", spp=2, progress=False)
     transport.save(tmp_path / "a.prt")
     loaded = prt.load_transport(tmp_path / "a.prt", grey_scene)
     assert_same(transport, loaded)

@@ -1,0 +1,92 @@
+"""Every element: a ray each for direct light, paths for indirect light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.checkpoint import Checkpoint
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.matrix import Indirect, MeanCosine, Visibility
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.path import PathTransport
+
+
+def exact_direct(solver: DirectTransport, scene: Scene, clock: Stopwatch, progress: bool) -> Parts:
+    """All direct light, phase ``direct``: bits, or in the texel basis the mean cosines of the solver's strata."""
+    with clock.phase("direct"):
+        stored = solver.row_storage(len(solver.points))
+        _trace(solver, stored, solver.rows, "direct", progress)
+    if solver.basis == "direction":
+        part: Visibility | MeanCosine = Visibility(
+            stored.astype(np.uint32, copy=False), scene.normals, solver.lighting
+        )
+    else:
+        part = MeanCosine(stored.astype(np.uint16, copy=False), solver.lighting)
+    elements = len(solver.points) * solver.lighting.n_directions
+    rays = int(share_above_horizon(solver.points, solver.lighting) * elements) * solver.rays_per_element
+    return Parts(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
+
+
+def path_traced(
+    solver: PathTransport,
+    lighting: CubemapLighting,
+    clock: Stopwatch,
+    progress: bool,
+    checkpoint: Path | None = None,
+) -> Indirect:
+    """All indirect light, phase ``indirect``, at the resolution of the solver.
+
+    Parameters
+    ----------
+    solver : PathTransport
+    lighting : CubemapLighting
+        To which it is interpolated.
+    clock : Stopwatch
+    progress : bool
+    checkpoint : Path, optional
+        Finished rows are kept in this file until all are.
+    """
+    with clock.phase("indirect"):
+        shape = (len(solver.points), solver.lighting.n_directions, solver.channels)
+        density = np.zeros(shape, dtype=np.float16)
+        kept = Checkpoint(checkpoint, density) if checkpoint else None
+        _trace(solver, density, lambda ids: solver.rows(ids).mean, "indirect", progress, kept)
+    return Indirect(density, upsampling(solver.lighting, lighting), lighting)
+
+
+def share_above_horizon(points: Points, lighting: CubemapLighting) -> float:
+    """Share of elements above the horizon, from a thousand vertices."""
+    some = points.normals[:: max(1, len(points) // 1000)]
+    return float((some @ lighting.directions.T > 0).mean())
+
+
+def _trace(
+    solver: DirectTransport | PathTransport,
+    stored: NDArray[Any],
+    rows: Callable[[NDArray[np.uint32]], NDArray[Any]],
+    name: str,
+    progress: bool,
+    kept: Checkpoint | None = None,
+) -> None:
+    """Fill an array with all rows of a solver, one wavefront at a time."""
+    first = kept.rows_done if kept else 0
+    with tqdm(total=len(stored), initial=first, desc=name, unit=" rows", disable=not progress) as bar:
+        for a in range(first, len(stored), solver.block_size):
+            ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
+            stored[a : a + len(ids)] = rows(ids)
+            if kept:
+                kept.append(stored[a : a + len(ids)])
+            bar.update(len(ids))
+    if kept:
+        kept.remove()

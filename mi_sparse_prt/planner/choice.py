@@ -1,0 +1,119 @@
+"""Which plan to carry out: predictions of time and error from measured costs, and the cheapest that is good enough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from mi_sparse_prt.planner.direct_costs import DirectCost
+from mi_sparse_prt.planner.gather_costs import GatherCosts
+from mi_sparse_prt.planner.path_costs import PathCosts
+from mi_sparse_prt.planner.plan import DENSE, GATHER, Plan
+from mi_sparse_prt.planner.sparse_costs import SparseCosts
+
+TARGET = 0.02  # where none is given
+MARGIN = 0.9  # of a target is aimed at: predictions are off at times
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What was measured.
+
+    Attributes
+    ----------
+    fixed : float
+        Seconds that every plan takes: for the pilot, and for held-out elements.
+    direct : dict
+        ``Plan.direct`` -> its cost.
+    paths, gather, sparse : PathCosts, GatherCosts, SparseCosts or None
+        None where there is no indirect light, or where it cannot be found so.
+    """
+
+    fixed: float
+    direct: dict[str, DirectCost]
+    paths: PathCosts | None = None
+    gather: GatherCosts | None = None
+    sparse: SparseCosts | None = None
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A plan, its seconds in all, and its relative L2 error."""
+
+    plan: Plan
+    seconds: float
+    error: float
+
+    def report(self, chosen: bool) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            **self.plan.report(),
+            "predicted_seconds": self.seconds,
+            "predicted_error": self.error,
+            "chosen": chosen,
+        }
+
+
+def predictions(costs: Costs, target: float, spp: int | None = None) -> list[Predicted]:
+    """All plans, the quickest first.
+
+    Parameters
+    ----------
+    costs : Costs
+    target : float
+        Relative L2 error of the whole matrix: plans by paths get as many samples as it takes.
+    spp : int, optional
+        Paths per element instead.
+    """
+    found = []
+    for name, light in costs.direct.items():
+        room = math.sqrt(max((MARGIN * target) ** 2 - light.error**2, 0.0))
+        for plan, seconds, error in _indirect(costs, name, room, spp):
+            found.append(
+                Predicted(plan, costs.fixed + light.seconds + seconds, math.hypot(light.error, error))
+            )
+    if costs.sparse is not None:
+        for share in DENSE:
+            plan = Plan("sparse", "sparse", dense=share, spp=costs.sparse.spp)
+            found.append(
+                Predicted(plan, costs.fixed + costs.sparse.seconds(share), costs.sparse.error(share))
+            )
+    return sorted(found, key=lambda p: p.seconds)
+
+
+def choose(plans: list[Predicted], target: float | None) -> Predicted:
+    """The quickest of the plans that meet a target, or the most exact if none does.
+
+    Without a target, a plan that misses 2% by some factor counts as if it took the square of that longer, as more
+    samples would: nobody asked for hours.
+    """
+    if target is None:
+        return min(plans, key=lambda p: p.seconds * max(p.error / (MARGIN * TARGET), 1.0) ** 2)
+    good = [p for p in plans if p.error <= MARGIN * target * (1 + 1e-9)]
+    return min(good, key=lambda p: p.seconds) if good else min(plans, key=lambda p: p.error)
+
+
+def finer(
+    costs: Costs, missed: Predicted, error: float, target: float, spp: int | None = None
+) -> Predicted | None:
+    """What to do after a plan turned out to have an error above the target: as if all predictions were as far off."""
+    aim = target * missed.error / error
+    plans = [p for p in predictions(costs, aim, spp) if p.error < missed.error]
+    return choose(plans, aim) if plans else None
+
+
+def _indirect(costs: Costs, direct: str, room: float, spp: int | None) -> Iterator[tuple[Plan, float, float]]:
+    """Ways to find indirect light, with the seconds and the error that it adds; ``room`` is what it may add."""
+    if costs.paths is None:
+        yield Plan(direct, "none"), 0.0, 0.0
+        return
+    if costs.gather is not None:
+        for rays, tolerance in GATHER:
+            cost = costs.gather.seconds(rays, tolerance), costs.gather.error(rays, tolerance)
+            yield Plan(direct, "gather", rays, tolerance), *cost
+    for resolution, seconds in costs.paths.seconds.items():
+        samples = costs.paths.samples(resolution, room) if spp is None else spp
+        plan = Plan(direct, "paths", resolution=resolution, spp=samples)
+        yield plan, samples * seconds, costs.paths.error(resolution, samples)

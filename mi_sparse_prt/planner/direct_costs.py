@@ -1,0 +1,135 @@
+"""What direct light costs and how far off it is: by all rays, and by consensus on a few patches of surface."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.planner.timing import seconds_per_row
+from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.bits import Bits, counts, listed, unpack
+from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.texel_edges import fractional_visibility
+from mi_sparse_prt.validation.elements import elements
+from mi_sparse_prt.validation.pilot_elements import PilotElements
+
+PATCH = 512  # vertices, next to each other
+PATCHES = 8  # in all, or one for each mesh
+INNER = (
+    4  # one in so many vertices of a patch is judged: those in the middle, which have all their neighbours
+)
+OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
+
+
+@dataclass(frozen=True)
+class DirectCost:
+    """Seconds of all direct light, and its relative L2 error."""
+
+    seconds: float
+    error: float
+
+
+def exact_cost(direct: DirectTransport, held: PilotElements) -> DirectCost:
+    """All rays. In the texel basis there is an error, by the number of strata."""
+    seconds = len(direct.points) * seconds_per_row(direct)
+    if direct.basis == "direction":
+        return DirectCost(seconds, 0.0)
+    ours = direct.elements(np.repeat(held.vertices, held.texels.shape[1]), held.texels.ravel())
+    square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
+    return DirectCost(seconds, math.sqrt(max(square, 0.0)))
+
+
+def edges_cost(scene: Scene, direct: DirectTransport, held: PilotElements) -> DirectCost:
+    """Texels' centres, and rays along edges of visibility, in the texel basis."""
+    solver = DirectTransport(scene.normalised, direct.lighting, direct.points)
+    centres = len(direct.points) * seconds_per_row(solver)
+    some = DirectTransport(scene.normalised, direct.lighting, points_at(direct.points, held.vertices))
+    places = np.arange(len(held.vertices))
+    bits = some.rows(places).astype(np.uint32, copy=False)
+    part, _ = fractional_visibility(some, bits)
+    start = time.perf_counter()
+    fractional_visibility(some, bits)
+    edges = (time.perf_counter() - start) * len(direct.points) / len(places)
+    ours = elements(part, np.repeat(places, held.texels.shape[1]), held.texels.ravel())
+    square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
+    return DirectCost(centres + edges, math.sqrt(max(square, 0.0)))
+
+
+def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
+    """Some of the points."""
+    return Points(*(x[ids] for x in (points.positions, points.normals, points.offset_normals, points.keys)))
+
+
+def consensus_cost(scene: Scene, direct: DirectTransport, seed: int) -> DirectCost:
+    """Consensus in the direction basis, from patches inside of which all rays are traced as well."""
+    patches, inner, stands_for = _patches(scene, seed)
+    ids = np.concatenate(patches)
+    state = Consensus(
+        direct.points.normals[ids],
+        AngularGrid(direct.lighting),
+        lambda vertices, texels: direct.visible(ids[vertices].astype(np.uint32), texels),
+    )
+    first = 0
+    for patch in patches:
+        p = scene.normalised_positions[patch]
+        by_levels(state, Surface(first, p, scene.normals[patch], direct.points.keys[patch]))
+        first += len(patch)
+    asked, seen, ids = state.evaluated[inner], state.visible[inner], ids[inner]
+    rays = float(stands_for @ counts(asked))
+    seconds = rays * _seconds_per_ray(direct, ids, asked) + OVERHEAD * len(direct.points)
+    power = (scene.albedo[ids] ** 2).sum(axis=1) * stands_for
+    exact = direct.rows(ids.astype(np.uint32)).astype(np.uint32, copy=False)
+    wrong, all_of_it = (float(power @ _energy(direct, ids, bits)) for bits in (exact ^ seen, exact))
+    return DirectCost(seconds, math.sqrt(wrong / max(all_of_it, 1e-300)))
+
+
+def _patches(
+    scene: Scene, seed: int
+) -> tuple[list[NDArray[np.int64]], NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbouring vertices around random ones of each mesh.
+
+    Returns also the places of those inside, that have all their neighbours, in the patches one after the other, and
+    how many vertices of the scene each of them stands for.
+    """
+    rng, patches, inner, stands_for, first = np.random.default_rng([seed, 3]), [], [], [], 0
+    for mesh in scene.meshes:
+        p = scene.normalised_positions[mesh.vertices]
+        centres = p[rng.choice(len(p), max(1, round(PATCHES * len(p) / scene.n_vertices)), replace=False)]
+        tree = cKDTree(p)
+        patch, core = (
+            np.unique(tree.query(centres, min(count, len(p)))[1])
+            for count in (PATCH, PATCH // INNER if len(p) > PATCH else PATCH)
+        )
+        patches.append(mesh.vertices.start + patch)
+        inner.append(first + np.searchsorted(patch, core))
+        stands_for.append(np.full(len(core), len(p) / len(core)))
+        first += len(patch)
+    return patches, np.concatenate(inner), np.concatenate(stands_for)
+
+
+def _seconds_per_ray(direct: DirectTransport, ids: NDArray[np.int64], asked: Bits) -> float:
+    """Of rays that consensus asks for, with others of the same vertices around them."""
+    rows, texels = listed(asked)
+    vertices = ids[rows].astype(np.uint32)
+    start = time.perf_counter()
+    direct.visible(vertices, texels)
+    return (time.perf_counter() - start) / max(len(rows), 1)
+
+
+def _energy(direct: DirectTransport, ids: NDArray[np.int64], bits: Bits) -> NDArray[np.float64]:
+    """Squared norms (n,) of white direct light where bits (n, words) are set."""
+    lighting, total = direct.lighting, np.zeros(len(ids))
+    for a in range(0, len(ids), PATCH):
+        part = slice(a, a + PATCH)
+        seen = unpack(bits[part], lighting.n_directions)
+        cosine = np.maximum(direct.points.normals[ids[part]] @ lighting.directions.T, 0)
+        total[part] = ((cosine * lighting.solid_angles) ** 2 * seen).sum(axis=1, dtype=np.float64)
+    return total

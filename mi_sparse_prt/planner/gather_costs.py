@@ -1,0 +1,204 @@
+"""What interreflection by finite elements costs, and how far off it is, measured on a few vertices."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.first_bounce import FEW_ROWS, MIXED, ROWS
+from mi_sparse_prt.transport.gather import NODES
+from mi_sparse_prt.transport.gather_matrix import gather_matrix
+from mi_sparse_prt.transport.sparse_product import product
+from mi_sparse_prt.validation.pilot_elements import PilotElements
+
+FEW, MANY = 64, 256  # rays per vertex of a pilot
+TIMED = 2048  # rays per vertex, where these are timed
+TEXELS = 192  # in common, of which the rank is told
+WIDTH = 64  # vectors at a time, for a timed product
+BLOCK = 1024  # rows at a time, likewise
+REPEATED = 32  # times the rows of G of a pilot
+EXPANSION = 40  # multiplications that expanding an element of D takes as long as
+LATER = 2  # bounces after the first one
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class GatherCosts:
+    """Cost and error for any number of rays per vertex and any tolerance of the rank.
+
+    Attributes
+    ----------
+    vertices, directions, channels : int
+    ray : float
+        Seconds of a gather ray, among those of its vertex.
+    multiplication : float
+        Seconds of one of the multiplications of dense matrices.
+    addition : float
+        Seconds of an entry of G times one column.
+    entries : float
+        Of G, per ray.
+    noise : dict
+        Rays -> relative L2 error of the whole matrix.
+    bias : float
+        That of interpolation between vertices, which no number of rays removes.
+    first : float
+        Norm of the first bounce, relative to the whole matrix.
+    growth : float
+        How much larger the norm of all bounces is.
+    spectrum : (k,) float
+        Energy that is left of the first bounce beyond each rank, relative.
+    """
+
+    vertices: int
+    directions: int
+    channels: int
+    ray: float
+    multiplication: float
+    addition: float
+    entries: float
+    noise: dict[int, float]
+    bias: float
+    first: float
+    growth: float
+    spectrum: NDArray[np.float64]
+
+    def error(self, rays: int, tolerance: float) -> float:
+        """Predicted relative L2 error of the whole matrix."""
+        fall = math.log(max(self.noise[FEW], 1e-12) / max(self.noise[MANY], 1e-12)) / math.log(MANY / FEW)
+        noise = self.noise[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
+        return self.growth * math.sqrt(noise**2 + self.bias**2 + (tolerance * self.first) ** 2)
+
+    def rank(self, tolerance: float) -> float:
+        """Predicted rank of the first bounce.
+
+        A few vertices and texels have a lower one than all of them. On the bunny (64,000 vertices, 6144 texels) 18 and
+        33 stood for 65 and 136.
+        """
+        few = int(np.searchsorted(-self.spectrum, -(tolerance**2)))
+        return 65 * (few / 18) ** 1.25
+
+    def seconds(self, rays: int, tolerance: float) -> float:
+        """Predicted time of rays and interreflections: the terms are the steps of ``transport.first_bounce``."""
+        nodes, rank, entries = min(self.vertices, NODES), self.rank(tolerance), rays * self.entries
+        rows = max(FEW_ROWS, ROWS * rank)
+        expanded = self.vertices * (self.directions + MIXED * rank)
+        dense = EXPANSION * expanded + rows * rank * self.directions * self.channels + 2 * nodes * rank**2
+        bounces = nodes * entries * rank * (1 + LATER * self.channels)
+        sparse = bounces + min(rows, nodes) * entries * self.directions * self.channels
+        return nodes * rays * self.ray + self.multiplication * dense + self.addition * sparse
+
+
+def gather_costs(
+    scene: Scene, direct: DirectTransport, held: PilotElements, max_depth: int, seed: int
+) -> GatherCosts | None:
+    """Measure at the vertices of the held-out elements; None where light cannot be gathered.
+
+    Parameters
+    ----------
+    scene : Scene
+    direct : DirectTransport
+        At all vertices.
+    held : PilotElements
+        With indirect light.
+    max_depth : int
+        Of the held-out elements.
+    seed : int
+    """
+    assert held.indirect is not None
+    if not scene.diffuse:
+        return None
+    pilot = _Pilot(scene, direct, held.vertices)
+    try:
+        few = [pilot.rays(FEW, seed + k) for k in range(2)]
+        many = [pilot.rays(MANY, seed + k) for k in range(2)]
+    except PrtError:  # too many backs of surfaces are in sight
+        return None
+    light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]
+    noise = [held.relative_square(held.weighted((a - b) ** 2 / 2)) for a, b in light]
+    first = held.indirect if max_depth == 3 else held.paths(3)
+    sizes = [held.relative_square(held.weighted(h.values[0] * h.values[1])) for h in (first, held.indirect)]
+    bias = held.relative_square(
+        held.weighted((light[1][0] - first.values[0]) * (light[1][1] - first.values[1]))
+    )
+    multiplication, addition = _seconds_of_products(direct, many[0])
+    # what does not grow with their number, an array of all vertices for one, is in both
+    times = [_seconds(partial(pilot.rays, count, seed)) for count in (FEW, TIMED)]
+    ray = max(times[1] - times[0], 0.0) / ((TIMED - FEW) * len(held.vertices))
+    return GatherCosts(
+        scene.n_vertices,
+        direct.lighting.n_directions,
+        light[0][0].shape[2],
+        ray,
+        multiplication,
+        addition,
+        len(many[0].data) / (MANY * len(held.vertices)),
+        dict(zip((FEW, MANY), np.sqrt(noise).tolist(), strict=True)),
+        math.sqrt(max(bias, 0.0)),
+        math.sqrt(max(sizes[0], 0.0)),
+        math.sqrt(max(sizes[1] / max(sizes[0], 1e-300), 1.0)),
+        pilot.spectrum(few[0], held.stand_for, seed),
+    )
+
+
+def _seconds_of_products(direct: DirectTransport, rays: scipy.sparse.csr_array) -> tuple[float, float]:
+    """Seconds of a multiplication and addition: of dense matrices, and of rows of G times some columns."""
+    rng = np.random.default_rng(0)
+    block = rng.random((BLOCK, direct.lighting.n_directions), np.float32)
+    mixing = rng.random((direct.lighting.n_directions, WIDTH), np.float32)
+    light = rng.random((len(direct.points), WIDTH), np.float32)
+    rows = scipy.sparse.vstack([rays] * REPEATED, format="csr")
+    dense = min(_seconds(lambda: block @ mixing) for _ in range(3)) / (WIDTH * block.size)
+    sparse = min(_seconds(lambda: product(rows, light)) for _ in range(3)) / (WIDTH * max(rows.nnz, 1))
+    return dense, sparse
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+class _Pilot:
+    """Gathers light at some vertices of a scene."""
+
+    def __init__(self, scene: Scene, direct: DirectTransport, vertices: NDArray[np.integer]) -> None:
+        self._scene, self._direct, self._vertices = scene, direct, vertices
+        self._albedo = scene.albedo[:, : 1 if scene.grey else 3]
+
+    def rays(self, count: int, seed: int) -> scipy.sparse.csr_array:
+        """Rows of G."""
+        return gather_matrix(self._scene, self._direct.points, count, seed, self._vertices)
+
+    def light(self, rays: scipy.sparse.csr_array, texels: NDArray[np.integer]) -> NDArray[np.float64]:
+        """The first bounce (k, t, channels) of white transport at t texels (k, t) of each vertex."""
+        row = np.repeat(np.arange(len(texels)), np.diff(rays.indptr))
+        asked = texels[row]  # [entry, texel]
+        seen = self._direct.elements(np.repeat(rays.indices, asked.shape[1]), asked.ravel()).reshape(
+            asked.shape
+        )
+        mean = scipy.sparse.csr_array(
+            (rays.data, np.arange(len(row)), rays.indptr), shape=(len(texels), len(row))
+        )
+        reflected = seen[:, :, None] * self._albedo[rays.indices][:, None]  # [entry, texel, channel]
+        return (mean @ reflected.reshape(len(row), -1)).reshape(*texels.shape, -1).astype(np.float64)
+
+    def spectrum(
+        self, rays: scipy.sparse.csr_array, stand_for: NDArray[np.float64], seed: int
+    ) -> NDArray[np.float64]:
+        """Energy of the first bounce beyond each rank, relative, at texels that all vertices share."""
+        n = self._direct.lighting.n_directions
+        texels = np.random.default_rng(seed).choice(n, min(n, TEXELS), replace=False)
+        light = self.light(rays, np.tile(texels, (len(stand_for), 1)))[:, :, 0] * np.sqrt(stand_for)[:, None]
+        squares = np.linalg.svd(light, compute_uv=False) ** 2
+        return 1 - np.cumsum(squares) / squares.sum()

@@ -1,0 +1,93 @@
+"""What the parts of a precomputation cost in this scene, on this machine, tried on a few hundred vertices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mi_sparse_prt.planner.choice import MARGIN, TARGET, Costs, choose, predictions
+from mi_sparse_prt.planner.direct_costs import consensus_cost, edges_cost, exact_cost
+from mi_sparse_prt.planner.gather_costs import gather_costs
+from mi_sparse_prt.planner.path_costs import (
+    COARSEST,
+    coarse_resolutions,
+    noise_of_a_path,
+    path_costs,
+    seconds_of_a_path,
+)
+from mi_sparse_prt.planner.sparse_costs import SparseCosts
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.validation import chosen, held_out
+from mi_sparse_prt.validation.pilot_elements import PilotElements
+
+VERTICES = 192  # of a pilot, in all meshes together
+LEAST_VERTICES = 16  # of each
+TEXELS = 16
+SEEDS = 1 << 20  # apart from those of the matrix
+LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samples per element
+CHECK = 0.3  # seconds of a check by held-out elements, beside its paths
+
+
+def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect: bool) -> Costs:
+    """Measure the costs of all plans that settings leave open.
+
+    Parameters
+    ----------
+    scene : Scene
+    direct : DirectTransport
+        At all vertices.
+    settings : Settings
+        ``method`` is ``"auto"`` or ``"brute_force"``.
+    indirect : bool
+        Whether there is indirect light.
+
+    Returns
+    -------
+    Costs
+        ``fixed`` is that of held-out elements.
+    """
+    count = max(LEAST_VERTICES, VERTICES // len(scene.meshes))
+    seed, lighting = settings.seed + SEEDS, direct.lighting
+    held = PilotElements(scene, lighting, settings.basis, settings.max_depth, indirect, seed, count, TEXELS)
+    auto, exact = settings.method == "auto", exact_cost(direct, held)
+    light = {"exact": exact}
+    if auto and settings.basis == "direction":
+        light["consensus"] = consensus_cost(scene, direct, seed)
+    elif auto:
+        light["edges"] = edges_cost(scene, direct, held)
+    costs = Costs(_check(held) * (1 if settings.target_error is None else 2), light)
+    if not indirect:
+        return costs
+    path = seconds_of_a_path(scene, settings, lighting)
+    fine, asked = lighting.resolution, settings.indirect_resolution
+    costs = replace(costs, paths=path_costs(scene, settings, held, path, [asked or fine]))
+    if auto:
+        costs = replace(costs, gather=gather_costs(scene, direct, held, settings.max_depth, seed))
+    if auto and settings.basis == "direction" and asked in (None, fine):
+        sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
+        costs = replace(costs, sparse=sparse)
+    if asked is None and not (auto and _too_dear(costs, settings, path, noise_of_a_path(held))):
+        every = [*coarse_resolutions(fine), fine]
+        costs = replace(costs, paths=path_costs(scene, settings, held, path, every))
+    return costs
+
+
+def _too_dear(costs: Costs, settings: Settings, path: float, noise: float) -> bool:
+    """Whether paths on a coarse cubemap, were they free of bias, would still take longer than another plan."""
+    target = MARGIN * (settings.target_error or TARGET)
+    best = choose(predictions(costs, target / MARGIN, settings.spp), settings.target_error)
+    samples = settings.spp or max(LESS_NOISE * (noise / target) ** 2, 1.0)
+    return best.error <= target and best.seconds < samples * path * (COARSEST / settings.resolution) ** 2
+
+
+def _check(held: PilotElements) -> float:
+    """Seconds of the check by held-out elements: nearly all of it is paths."""
+    if held.indirect is None:
+        return CHECK
+    sizes = held.sizes * held.lighting.n_directions  # [mesh]
+    share = max(chosen.PATHS // len(sizes), chosen.FEW_PATHS)
+    counts = np.maximum(np.minimum(share, sizes // 16), np.minimum(chosen.FEWEST_PATHS, sizes))
+    return CHECK + float(counts.sum()) * held_out.SPP * held.indirect.seconds

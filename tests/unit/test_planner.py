@@ -1,0 +1,230 @@
+"""Plans: what they refuse, what measured costs predict, and which one is chosen."""
+
+import json
+import math
+import warnings
+
+import numpy as np
+import pytest
+from conftest import GREY, build, still_life
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.methods.consensus import by_consensus
+from mi_sparse_prt.planner.choice import MARGIN, Costs, Predicted, choose, finer, predictions
+from mi_sparse_prt.planner.direct_costs import PATCH, DirectCost, consensus_cost
+from mi_sparse_prt.planner.gather_costs import GatherCosts
+from mi_sparse_prt.planner.path_costs import PathCosts
+from mi_sparse_prt.planner.pilot import measure
+from mi_sparse_prt.planner.plan import GATHER, Plan
+from mi_sparse_prt.planner.sparse_costs import SparseCosts
+from mi_sparse_prt.settings import Settings
+from mi_sparse_prt.transport.direct import DirectTransport
+
+LIGHTING = prt.CubemapLighting(4)
+EXACT = {"exact": DirectCost(10.0, 0.0)}
+BOTH = EXACT | {"consensus": DirectCost(4.0, 0.012)}
+# one path per element: 100 s at 32 x 32, an error of 0.3; a coarser cubemap is 4% off, an even coarser one 10%
+PATHS = PathCosts({8: 6.25, 16: 25.0, 32: 100.0}, {8: 0.3, 16: 0.3, 32: 0.3}, {8: 0.1, 16: 0.04, 32: 0.0})
+
+
+class FakeGather(GatherCosts):
+    """A hundredth of a second per ray of a vertex, and an error of 8% at one of these."""
+
+    def __init__(self) -> None:
+        pass
+
+    def seconds(self, rays: int, tolerance: float) -> float:
+        return rays / 100
+
+    def error(self, rays: int, tolerance: float) -> float:
+        return 0.08 / math.sqrt(rays / 16)
+
+
+def best(costs: Costs, target: float, spp: int | None = None) -> Predicted:
+    return choose(predictions(costs, target, spp), target)
+
+
+# ------------------------------------------------------------------------------------ the choice
+
+
+def test_direct_light_alone_is_by_consensus_if_it_is_good_enough():
+    assert best(Costs(0, BOTH), 0.02).plan == Plan("consensus")
+    assert best(Costs(0, BOTH), 0.012).plan == Plan("exact")
+    dear = BOTH | {"consensus": DirectCost(11.0, 0.012)}
+    assert best(Costs(0, dear), 0.02).plan == Plan("exact")
+
+
+def test_brute_force_where_it_is_cheapest():
+    """No gathering, a loose target: a coarse cubemap, and as many samples as leave room for its bias."""
+    found = best(Costs(1.0, EXACT, PATHS), 0.1)
+    room = (MARGIN * 0.1) ** 2 - 0.04**2
+    assert found.plan == Plan("exact", "paths", resolution=16, spp=math.ceil(0.09 / room))
+    assert found.seconds == pytest.approx(1 + 10 + 25 * found.plan.spp)
+    assert 0.9 * MARGIN * 0.1 < found.error <= MARGIN * 0.1
+    assert best(Costs(1.0, EXACT, PATHS), 0.04).plan.resolution == 32
+
+
+def test_the_fewest_rays_that_meet_the_target():
+    costs = Costs(0, BOTH, PATHS, FakeGather())
+    assert best(costs, 0.05).plan == Plan("consensus", "gather", *GATHER[0])
+    found = best(costs, 0.03)  # 4% of 64 rays are too much
+    assert found.plan == Plan("consensus", "gather", *GATHER[1])
+    assert found.error == pytest.approx(math.hypot(0.012, 0.02))
+    assert found.seconds == pytest.approx(4 + 2.56)
+    # together they miss what each alone would meet
+    assert best(costs, 0.0234).plan == Plan("exact", "gather", *GATHER[1])
+
+
+def test_the_most_exact_plan_if_none_is_good_enough():
+    found = best(Costs(0, BOTH, PATHS, FakeGather()), 1e-4)
+    assert found == min(predictions(Costs(0, BOTH, PATHS, FakeGather()), 1e-4), key=lambda p: p.error)
+    assert found.plan.spp == 4096
+
+
+def test_without_a_target_nobody_waits_for_hours():
+    """Where paths alone meet 2%, in hours, and "sparse" comes close: the latter; with a target the former."""
+    sparse = SparseCosts(vertices=1000, rays=10.0, path=100.0, noise=0.6, spp=16)
+    costs = Costs(0, EXACT, PathCosts({32: 100.0}, {32: 0.3}, {32: 0.0}), None, sparse)
+    plans = predictions(costs, 0.02)
+    hours = choose(plans, 0.02)
+    assert (hours.plan.indirect, hours.error) == ("paths", pytest.approx(0.018, rel=0.01))
+    assert hours.seconds > 7 * 3600
+    usual = choose(plans, None)
+    assert usual.plan.indirect == "sparse"
+    assert usual.error < 0.05 and usual.seconds < 600
+
+
+def test_given_samples_are_kept():
+    plans = predictions(Costs(0, EXACT, PATHS), 0.02, spp=3)
+    assert {p.plan.spp for p in plans} == {3}
+    assert [p.seconds for p in plans] == pytest.approx([10 + 3 * s for s in (6.25, 25, 100)])
+
+
+def test_after_a_miss_as_if_all_predictions_were_as_far_off():
+    costs = Costs(0, EXACT, None, None)
+    direct = best(costs, 0.02)
+    assert finer(costs, direct, 0.03, 0.02) is None
+    costs = Costs(0, EXACT, PATHS, FakeGather())
+    first = best(costs, 0.025)
+    assert (first.plan.rays, first.error) == (256, pytest.approx(0.02))
+    assert finer(costs, first, 0.03, 0.025).plan.rays == 1024  # 1% is within 2.5% x 2 / 3
+    assert finer(costs, first, 0.07, 0.025).plan.rays == 4096
+
+
+def test_a_report_is_json():
+    found = best(Costs(0, BOTH, PATHS, FakeGather()), 0.05)
+    report = found.report(True)
+    assert json.loads(json.dumps(report)) == report
+    assert report["parameters"] == {"rays": 64, "tolerance": 0.06}
+    assert report["chosen"] and report["direct"] == "consensus"
+
+
+# ------------------------------------------------------------------------------------ plans
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(("magic",), "magic"), (("exact", "magic"), "magic"), (("sparse", "gather"), "does not go with")],
+)
+def test_plans_that_do_not_exist(arguments, message):
+    with pytest.raises(prt.PrtError, match=message) as error:
+        Plan(*arguments)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("direct", "other"), [("consensus", "texel"), ("edges", "direction")])
+def test_plans_for_another_basis_are_refused(grey_scene, direct, other):
+    with pytest.raises(prt.PrtError, match="basis"):
+        prt.precompute(grey_scene, LIGHTING, Plan(direct), basis=other, progress=False)
+
+
+def test_a_plan_is_carried_out(grey_scene):
+    """A plan of paths is brute force; of consensus, it has its bits and counts its rays."""
+    by_name = prt.precompute(
+        grey_scene, LIGHTING, "brute_force", spp=3, indirect_resolution=2, progress=False
+    )
+    plan = Plan("exact", "paths", resolution=2, spp=3)
+    by_plan = prt.precompute(grey_scene, LIGHTING, plan, progress=False)
+    assert np.array_equal(by_plan.indirect.density, by_name.indirect.density)
+    assert by_plan.report["rays"] == by_name.report["rays"]
+    assert by_plan.report["parameters"]["spp"] == 3
+    assert by_plan.report["plan"] == {
+        "direct": "exact",
+        "indirect": "paths",
+        "parameters": {"resolution": 2, "spp": 3},
+    }
+
+    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
+    state = by_consensus(grey_scene, direct, Stopwatch())
+    mixed = prt.precompute(grey_scene, LIGHTING, Plan("consensus", "gather", 64, 0.06), progress=False)
+    assert np.array_equal(mixed.direct.bits, state.visible)
+    evaluated = int(np.bitwise_count(state.evaluated).sum())
+    assert mixed.report["elements"]["direct"] == mixed.report["elements_evaluated"] == evaluated
+    assert mixed.report["rays"] == {"direct": evaluated, "gather": 64 * grey_scene.n_vertices}
+
+
+# ------------------------------------------------------------------------------------ what is measured
+
+
+def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene):
+    """The error of small meshes, of which all is tried, against that of the whole matrix."""
+    assert all(mesh.vertices.stop - mesh.vertices.start <= PATCH for mesh in grey_scene.meshes)
+    lighting = prt.CubemapLighting(8)
+    direct = DirectTransport(grey_scene.normalised, lighting, vertex_points(grey_scene))
+    predicted = consensus_cost(grey_scene, direct, 0).error
+    exact, ours = (
+        prt.precompute(grey_scene, lighting, Plan(how, "none"), progress=False).rows(
+            range(grey_scene.n_vertices)
+        )
+        for how in ("exact", "consensus")
+    )
+    true = np.linalg.norm(ours - exact) / np.linalg.norm(exact)
+    assert true > 0.005
+    assert predicted == pytest.approx(true, rel=1e-3)
+
+
+def test_predicted_errors_are_those_of_the_matrix():
+    """Paths, coarse and fine, and gathered light: the error that held-out elements estimate, within its noise.
+
+    Expected: the pilot's 192 vertices and the check's elements know it within some percent each.
+    """
+    scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
+    direct = DirectTransport(scene.normalised, lighting, vertex_points(scene))
+    costs = measure(scene, direct, Settings(8, target_error=0.04), indirect=True)
+    assert costs.paths is not None and costs.gather is not None
+    plans = [
+        (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.2),
+        (Plan("exact", "paths", resolution=4, spp=8), costs.paths.error(4, 8), 0.25),
+        (Plan("exact", "gather", 64, 0.06), costs.gather.error(64, 0.06), 0.5),
+    ]
+    for plan, predicted, tolerance in plans:
+        found = prt.precompute(scene, lighting, plan, progress=False).report["estimated_error"]["total"]
+        print(f"{plan.indirect}: predicted {predicted:.3%}, estimated {found:.3%}")
+        assert predicted == pytest.approx(found, rel=tolerance)
+
+
+@pytest.mark.parametrize("indirect", [True, False])
+def test_costs_of_what_is_left_open(grey_scene, indirect):
+    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene), "texel")
+    costs = measure(grey_scene, direct, Settings(4, basis="texel", indirect_resolution=2), indirect)
+    assert costs.direct.keys() == {"exact", "edges"}  # consensus and "sparse" are of the other basis
+    assert 0 < costs.direct["edges"].error < costs.direct["exact"].error
+    assert costs.sparse is None
+    assert 0 < costs.direct["exact"].error < 0.2
+    assert (costs.gather is not None) == (costs.paths is not None) == indirect
+    if costs.paths:
+        assert costs.paths.seconds.keys() == {2}
+
+
+def test_other_materials_are_not_gathered_from():
+    shapes = still_life(GREY)
+    shapes["box"]["bsdf"] = {"type": "roughconductor"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", prt.PrtWarning)
+        scene = build(0.5, **shapes)
+    direct = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    costs = measure(scene, direct, Settings(4, max_depth=3, spp=2), indirect=True)
+    assert costs.gather is None
+    assert costs.paths is not None and costs.sparse is not None
