@@ -1,7 +1,7 @@
 """Columns of a local transport matrix chosen once for all rows of a region, as others than [HR10] do.
 
-All take the region's dense rows, whose columns (one value per dense vertex) they compare, and a random generator.
-Columns of zeros are left out: they say nothing about weights, and [HPB07] ignores them as well.
+All choices take the region's dense rows, whose columns (one value per dense vertex) they compare, and a random
+generator. Columns of zeros are left out: they say nothing about weights, and [HPB07] ignores them as well.
 
 [HPB07] Hasan, Pellacini, Bala: Matrix Row-Column Sampling for the Many-Light Problem, 2007.
 [WDT09] Wang, Dong, Tong, Lin, Guo: Kernel Nystroem Method for Light Transport, 2009.
@@ -9,16 +9,77 @@ Columns of zeros are left out: they say nothing about weights, and [HPB07] ignor
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
+
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 Ids = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
+Columns = Callable[[Singles, int, np.random.Generator], Ids]
+
+SHARE = 0.06  # of the columns are sampled ([HR10] Figure 5)
+REGION = 1000  # vertices of a region that shares its columns, on average
 BY_SAMPLING = 2 / 3  # of the clusters; the others are made by splitting ([HPB07] 3.5)
 LLOYD_STEPS = 10
+
+
+def regions(dense_positions: NDArray[np.floating], n: int, seed: int) -> Ids:
+    """Compact regions of the dense vertices of a mesh, about 1000 of all its vertices to a region.
+
+    Parameters
+    ----------
+    dense_positions : (n_dense, 3) float, any frame
+    n : int
+        Vertices of the mesh.
+    seed : int
+
+    Returns
+    -------
+    (n_dense,) int64
+        Region of each dense vertex, numbered without gaps.
+    """
+    count = min(max(1, round(n / REGION)), len(dense_positions))
+    p = dense_positions.astype(np.float64)
+    rng = np.random.default_rng(seed)
+    start = p[rng.choice(len(p), count, replace=False)]
+    with warnings.catch_warnings():  # an empty region is left out
+        warnings.simplefilter("ignore", UserWarning)
+        _, labels = kmeans2(p, start, minit="matrix")
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)
+
+
+def columns_of_regions(
+    rows: Singles, region: Ids, choose: Columns, count: int, seed: int
+) -> NDArray[np.int32]:
+    """Columns that each region samples.
+
+    Parameters
+    ----------
+    rows : (n_dense, n_directions) float32
+    region : (n_dense,) int64
+        Region of each row.
+    choose : callable
+        One of the choices below.
+    count : int
+        Columns of a region.
+    seed : int
+
+    Returns
+    -------
+    (regions, count) int32
+        -1 where there are fewer.
+    """
+    table = np.full((int(region.max()) + 1, count), -1, np.int32)
+    for k, columns in enumerate(table):
+        chosen = choose(rows[region == k], count, np.random.default_rng([seed, k]))
+        columns[: len(chosen)] = chosen
+    return table
 
 
 def random_columns(rows: NDArray[np.float32], count: int, rng: np.random.Generator) -> Ids:

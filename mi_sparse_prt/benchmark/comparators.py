@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.columns import clustered_columns, k_means_columns, random_columns
+from mi_sparse_prt.benchmark.columns import (
+    SHARE,
+    Columns,
+    clustered_columns,
+    columns_of_regions,
+    k_means_columns,
+    random_columns,
+    regions,
+)
 from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
@@ -35,8 +40,7 @@ from mi_sparse_prt.sampling.spatial import choose_dense, weighted_choice
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 
-ROWS, COLUMNS = 0.25, 0.06  # Figure 5
-REGION = 1000  # vertices of a region that shares its columns, on average
+ROWS = 0.25  # Figure 5
 INTERPOLATED_FROM = 12  # neighbours, as many as method="sparse" has
 
 FITTED = {
@@ -56,8 +60,6 @@ BY_REGION = {
     "k_means_columns": k_means_columns,
     "random_columns": random_columns,
 }
-
-Columns = Callable[[NDArray[np.float32], int, np.random.Generator], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ def compare_choices(
     if n_vertices < 1:
         raise PrtError(f"n_vertices is {n_vertices}: give 1 or more")
     surface = _surface(scene, lighting, mesh)
-    n, count = len(surface.positions), max(1, round(COLUMNS * lighting.n_directions))
+    n, count = len(surface.positions), max(1, round(SHARE * lighting.n_directions))
     by_rank = choose_dense(
         surface.positions, surface.keys, lambda ids: surface.bits[ids], ROWS, radius=RADIUS, seed=seed
     ).ids
@@ -188,8 +190,8 @@ def compare_choices(
     if not norms.any():
         raise PrtError(f"the mesh {mesh!r} sees no light at {len(sample)} vertices: choose another mesh")
 
-    regions = _regions(surface.positions[by_rank], n, seed)
-    results = _from_rank(surface, _local(surface, sample, by_rank), regions, count, seed, progress)
+    region = regions(surface.positions[by_rank], n, seed)
+    results = _from_rank(surface, _local(surface, sample, by_rank), region, count, seed, progress)
     results["random_rows"] = _by_vertex(_local(surface, sample, at_random), count, n - len(at_random))
     errors = {}
     for name in (*FITTED, *INTERPOLATED):
@@ -205,7 +207,7 @@ def compare_choices(
         "row_share": len(by_rank) / n,
         "columns": count,
         "column_share": count / lighting.n_directions,
-        "regions": int(regions.max()) + 1,
+        "regions": int(region.max()) + 1,
         "error": {name: error for name, (error, _) in errors.items()},
         "standard_error": {name: spread for name, (_, spread) in errors.items()},
         "directions": {name: results[name].directions / lighting.n_directions for name in FITTED},
@@ -256,25 +258,13 @@ def _local(surface: _Surface, sample: NDArray[np.int64], dense: NDArray[np.int64
     return _Local(surface.rows(sparse), sparse, dense, surface.rows(dense), surface.features(dense), near)
 
 
-def _regions(dense_positions: NDArray[np.float32], n: int, seed: int) -> NDArray[np.int64]:
-    """Region (n_dense,) of each dense vertex of a mesh of n vertices, numbered without gaps."""
-    count = min(max(1, round(n / REGION)), len(dense_positions))
-    p = dense_positions.astype(np.float64)
-    rng = np.random.default_rng(seed)
-    start = p[rng.choice(len(p), count, replace=False)]
-    with warnings.catch_warnings():  # an empty region is left out
-        warnings.simplefilter("ignore", UserWarning)
-        _, labels = kmeans2(p, start, minit="matrix")
-    return np.unique(labels, return_inverse=True)[1].astype(np.int64)
-
-
 def _from_rank(
-    surface: _Surface, local: _Local, regions: NDArray[np.int64], count: int, seed: int, progress: bool
+    surface: _Surface, local: _Local, region: NDArray[np.int64], count: int, seed: int, progress: bool
 ) -> dict[str, _Result]:
     """All choices but ``random_rows``, from dense rows chosen by rank."""
     results = {"features": _by_vertex(local, count, len(surface.positions) - len(local.dense))}
     for name in tqdm(BY_REGION, desc="columns", disable=not progress):
-        results[name] = _by_region(local, regions, BY_REGION[name], count, seed)
+        results[name] = _by_region(local, region, BY_REGION[name], count, seed)
     return results | _interpolations(surface, local)
 
 
@@ -287,15 +277,12 @@ def _by_vertex(local: _Local, count: int, n_sparse: int) -> _Result:
     return _fitted(local, directions, seconds)
 
 
-def _by_region(local: _Local, regions: NDArray[np.int64], choose: Columns, count: int, seed: int) -> _Result:
+def _by_region(local: _Local, region: NDArray[np.int64], choose: Columns, count: int, seed: int) -> _Result:
     """Columns chosen for each region; a sparse vertex belongs to that of the nearest dense one."""
     start = time.perf_counter()
-    table = np.full((regions.max() + 1, count), -1, np.int32)
-    for region, columns in enumerate(table):
-        chosen = choose(local.rows[regions == region], count, np.random.default_rng([seed, region]))
-        columns[: len(chosen)] = chosen
+    table = columns_of_regions(local.rows, region, choose, count, seed)
     seconds = time.perf_counter() - start
-    return _fitted(local, table[regions[local.near[:, 0]]], seconds)
+    return _fitted(local, table[region[local.near[:, 0]]], seconds)
 
 
 def _fitted(local: _Local, directions: NDArray[np.int32], seconds: float) -> _Result:

@@ -7,6 +7,7 @@ estimates of r: their noise drops out, and the sampling of vertices matters only
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,11 +57,37 @@ def mean_square(
 
 
 def relative_l2(error: MeanSquare, norm: MeanSquare) -> tuple[float, float]:
-    """sqrt(error / norm) and its standard error, by a bootstrap over the sampled vertices, which both share."""
-    drawn = np.random.default_rng(0).integers(len(error.rest), size=(RESAMPLINGS, len(error.rest)))
-    errors = error.known + error.rest[drawn].mean(axis=1)
-    norms = norm.known + norm.rest[drawn].mean(axis=1)
-    return float(_root(error.value, norm.value)), float(_root(errors, norms).std())
+    """sqrt(error / norm) and its standard error, by a bootstrap over the sampled vertices, which both may share."""
+    return joint_relative_l2([error], [norm], [1])
+
+
+def joint_relative_l2(
+    errors: Sequence[MeanSquare], norms: Sequence[MeanSquare], sizes: Sequence[float]
+) -> tuple[float, float]:
+    """Relative L2 of several meshes together, and its standard error.
+
+    Parameters
+    ----------
+    errors, norms : sequence of MeanSquare
+        One of each for every mesh. Where both have as many samples, these are of the same vertices.
+    sizes : sequence of float
+        How many vertices each mesh has.
+    """
+    square, squares = _together(errors, sizes)
+    norm, resampled = _together(norms, sizes)
+    return float(_root(square, norm)), float(_root(squares, resampled).std())
+
+
+def _together(parts: Sequence[MeanSquare], sizes: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
+    """Sum over meshes of size times mean square, and the same of resampled vertices (RESAMPLINGS,)."""
+    value, resampled = 0.0, np.zeros(RESAMPLINGS)
+    for mesh, (part, size) in enumerate(zip(parts, sizes, strict=True)):
+        value += size * part.value
+        k = len(part.rest)
+        # The seed makes samples of the same vertices be drawn together
+        drawn = np.random.default_rng([mesh, k]).integers(k, size=(RESAMPLINGS, k))
+        resampled += size * (part.known + part.rest[drawn].mean(axis=1))
+    return value, resampled
 
 
 def row_errors(squares: NDArray[np.floating], norms: NDArray[np.floating]) -> NDArray[np.float64]:

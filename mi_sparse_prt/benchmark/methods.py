@@ -55,8 +55,8 @@ def measure_methods(
     Returns
     -------
     dict
-        JSON as it is. ``brute_force``: ``direct_seconds`` (whole matrix), ``paths_seconds`` (from whole wavefronts of
-        successive rows of each mesh) and its standard error, ``seconds`` (their sum), and the ``errors`` that its 16
+        JSON as it is. ``brute_force``: ``direct_seconds`` (whole matrix), ``paths_seconds`` (from some whole wavefronts
+        of successive rows) and its standard error, ``seconds`` (their sum), and the ``errors`` that its 16
         paths leave. ``reference_noise`` per mesh, relative L2 of the matrix, and ``lighting_noise`` per mesh and
         environment. For each of ``methods``:
 

@@ -22,6 +22,8 @@ from mi_sparse_prt.cli.tables import (
     relighting_table,
     scene_report,
     scene_tables,
+    sizes_tables,
+    time_error_tables,
     validation_table,
 )
 from mi_sparse_prt.cost import Stopwatch
@@ -115,6 +117,9 @@ Variant = Annotated[
 ]
 
 
+DEFAULT_RESOLUTION = 32  # texels along an edge of a face
+
+
 class Method(StrEnum):
     """Which elements are evaluated."""
 
@@ -140,7 +145,7 @@ def precompute(
     ],
     resolution: Annotated[
         int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
-    ] = 32,
+    ] = DEFAULT_RESOLUTION,
     method: Annotated[
         Method,
         typer.Option(
@@ -424,7 +429,7 @@ def benchmark(
     scene: SceneFile,
     resolution: Annotated[
         int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
-    ] = 32,
+    ] = DEFAULT_RESOLUTION,
     repeats: Annotated[
         int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")
     ] = 3,
@@ -442,11 +447,21 @@ def benchmark(
             help="Compare choices of rows and columns, and radii of neighbours, on every mesh instead.",
         ),
     ] = False,
+    time_error: Annotated[
+        bool,
+        typer.Option("--time-error", help="Run every method instead, and compare time and error of all."),
+    ] = False,
+    sizes: Annotated[
+        bool,
+        typer.Option(
+            "--sizes", help="Measure cost at 10,000 to 500,000 vertices and resolutions of 8 to 64 instead."
+        ),
+    ] = False,
     figures: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Draw what --method or --choices measures: PNG files there.",
+            help="Draw what --method, --choices, --time-error or --sizes measures: PNG files there.",
             show_default=False,
         ),
     ] = None,
@@ -461,36 +476,51 @@ def benchmark(
     Example: mi-sparse-prt benchmark scenes_xml/bunny.xml --json benchmark.json
 
     With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
-    With --choices --figures FOLDER: its Figures 5 and 6.
+    With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
+    With --sizes --figures FOLDER: how cost grows.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
-    from mi_sparse_prt.benchmark import run_benchmark
-    from mi_sparse_prt.benchmark.choices import measure_choices
-    from mi_sparse_prt.benchmark.methods import measure_methods
+    from mi_sparse_prt import benchmark
 
-    if figures is not None and not (method or choices):
-        raise typer.BadParameter("there are figures of --method and --choices only", param_hint="--figures")
-    if method and choices:
-        raise typer.BadParameter("one at a time: leave --choices or --method out", param_hint="--choices")
+    asked = {"--method": bool(method), "--choices": choices, "--time-error": time_error, "--sizes": sizes}
+    if sum(asked.values()) > 1:
+        raise typer.BadParameter(
+            "one at a time", param_hint=" / ".join(n for n, given in asked.items() if given)
+        )
+    if figures is not None and not any(asked.values()):
+        raise typer.BadParameter(f"there are figures of {', '.join(asked)} only", param_hint="--figures")
+    if sizes and (edge_length is not None or resolution != DEFAULT_RESOLUTION):
+        raise typer.BadParameter("it varies --edge-length and --resolution itself", param_hint="--sizes")
     with running(json_file, quiet) as command:
         if figures is not None:
             check_folder(figures)
-        loaded = prt.load_scene(scene, edge_length, **_definitions(define))
-        lighting = prt.CubemapLighting(resolution)
+        parameters, progress = _definitions(define), not quiet
         with command.prompt_interrupts():
-            if method:
-                command.report = measure_methods(
-                    loaded, lighting, [m.value for m in method], not quiet, figures
-                )
-            elif choices:
-                command.report = measure_choices(loaded, lighting, not quiet, figures)
+            if sizes:
+                command.report = benchmark.cost_against_size(scene, parameters, progress, figures)
+                tables = sizes_tables(command.report)
             else:
-                command.report = run_benchmark(loaded, lighting, repeats, progress=not quiet)
+                loaded, lighting = (
+                    prt.load_scene(scene, edge_length, **parameters),
+                    prt.CubemapLighting(resolution),
+                )
+                if method:
+                    names = [m.value for m in method]
+                    command.report = benchmark.measure_methods(loaded, lighting, names, progress, figures)
+                    tables = methods_tables(command.report)
+                elif choices:
+                    command.report = benchmark.measure_choices(loaded, lighting, progress, figures)
+                    tables = choices_tables(command.report)
+                elif time_error:
+                    command.report = benchmark.time_against_error(loaded, lighting, progress, figures)
+                    tables = time_error_tables(command.report)
+                else:
+                    command.report = benchmark.run_benchmark(loaded, lighting, repeats, progress)
+                    tables = benchmark_tables(command.report)
         if figures is not None:
             command.written.append(figures)
-        tables = methods_tables if method else choices_tables if choices else benchmark_tables
-        command.show(*tables(command.report))
+        command.show(*tables)
 
 
 def _scene_of(

@@ -217,6 +217,74 @@ def methods_tables(report: dict[str, Any]) -> list[Table]:
     return [table, *(_method_table(method, found) for method, found in report["methods"].items())]
 
 
+def time_error_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``time_against_error`` found: every method, the quickest first."""
+    bare, noise = report["bare_rays"], report["reference_noise"]["total"]
+    table = _table(
+        f"Time against error (bare occlusion rays: {_duration(bare['seconds'])}, noise of the reference: "
+        f"{_share(noise)})",
+        "",
+        "time",
+        "/ bare rays",
+        "relative L2",
+        "+-",
+        "brute force at that error",
+        "/ own time",
+    )
+    lines = []
+    for name, found in report["methods"].items():
+        error, equal = found["relative_l2"], found["equal_error"]
+        lines.append(
+            (
+                found["seconds"],
+                found["label"] if "plan" not in found else f"{name}: {_plan(found['plan'])}",
+                f"{found['over_bare_rays']:.2f}",
+                error["total"],
+                error["standard_error"]["total"],
+                "" if equal["seconds"] is None else _duration(equal["seconds"]),
+                "" if equal["speed_up"] is None else f"{equal['speed_up']:.3g}",
+            )
+        )
+    for kind in ("brute_force", "adjoint"):
+        for point in report[kind]:
+            label = f"{kind.replace('_', ' ')}, {point['spp']} paths per element"
+            error, over = point["relative_l2"], point["seconds"] / bare["seconds"]
+            deviation = error["standard_error"]["total"]
+            lines.append((point["seconds"], label, f"{over:.2f}", error["total"], deviation, "", ""))
+    for seconds, label, over, error, deviation, equal, speed_up in sorted(lines):
+        table.add_row(label, _duration(seconds), over, _share(error), _share(deviation), equal, speed_up)
+    return [table, *([_sentences("Skipped", report["skipped"])] if report["skipped"] else [])]
+
+
+def sizes_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``cost_against_size`` found, for each series of sizes."""
+    tables = []
+    for series in ("by_vertices", "by_resolution"):
+        table = _table(
+            series.replace("_", " ").capitalize(), "", "n", "direct alone", "whole", "peak memory", "error"
+        )
+        for found in report[series]:
+            direct, whole = found["direct"], found["whole"]
+            table.add_row(
+                f"{found['vertices']:,} vertices, {_plan(whole['plan'])}",
+                str(found["resolution"]),
+                _duration(direct["seconds"]),
+                _duration(whole["seconds"]),
+                _bytes(whole["peak_memory_bytes"]),
+                _share(whole["estimated_error"]),
+            )
+        tables.append(table)
+    return [*tables, *([_sentences("Skipped", report["skipped"])] if report["skipped"] else [])]
+
+
+def _plan(plan: dict[str, Any]) -> str:
+    """A plan in a few words."""
+    parameters = " ".join(
+        f"{name} {value}" for name, value in plan["parameters"].items() if value is not None
+    )
+    return f"{plan['direct']}, {plan['indirect']} {parameters}".strip()
+
+
 def choices_tables(report: dict[str, Any]) -> list[Table]:
     """What ``measure_choices`` found: relative L2 by choice, and by radius."""
     return [

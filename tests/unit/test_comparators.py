@@ -14,6 +14,7 @@ from mi_sparse_prt.benchmark.columns import (
     clustered_columns,
     k_means_columns,
     random_columns,
+    regions,
 )
 from mi_sparse_prt.benchmark.comparators import (
     BY_REGION,
@@ -23,7 +24,6 @@ from mi_sparse_prt.benchmark.comparators import (
     _by_vertex,
     _Local,
     _local,
-    _regions,
     _relative,
     _surface,
     compare_choices,
@@ -240,11 +240,11 @@ def test_rows_of_rank_one_are_known_but_for_the_shrinkage(name: str) -> None:
     features = pack(np.ones((6, m), bool))
     near = np.array([rng.permutation(6)[:4] for _ in range(9)], np.int32)
     local = _Local(exact, np.arange(9), np.arange(6), rows, features, near)
-    regions = np.array([0, 0, 1, 1, 1, 0])
+    region = np.array([0, 0, 1, 1, 1, 0])
     result = (
         _by_vertex(local, 5, 9)
         if name == "features"
-        else _by_region(local, regions, BY_REGION[name], 5, seed=0)
+        else _by_region(local, region, BY_REGION[name], 5, seed=0)
     )
     assert result.directions == 5
     assert np.sqrt(result.squared) == pytest.approx(RELATIVE_LAMBDA * np.linalg.norm(exact, axis=1), rel=1e-3)
@@ -272,10 +272,10 @@ def test_standard_errors_are_the_spread_of_samples() -> None:
 def test_regions_are_numbered_without_gaps_and_compact() -> None:
     rng = np.random.default_rng(0)
     p = np.concatenate([rng.random((60, 3)) + 50 * k for k in range(3)]).astype(np.float32)
-    labels = _regions(p, 8000, seed=0)
+    labels = regions(p, 8000, seed=0)
     assert sorted(set(labels)) == list(range(labels.max() + 1)) and labels.max() < 8
-    assert len(_regions(p[:1], 10**6, seed=0)) == 1
-    assert np.array_equal(labels, _regions(p, 8000, seed=0))
+    assert len(regions(p[:1], 10**6, seed=0)) == 1
+    assert np.array_equal(labels, regions(p, 8000, seed=0))
 
 
 def test_the_plot_has_a_bar_for_each_choice(report: dict, artefact) -> None:

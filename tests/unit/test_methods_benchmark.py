@@ -10,9 +10,11 @@ from conftest import COLOURS, build, diffuse, still_life
 from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark import brute_force as brute_force_times
 from mi_sparse_prt.benchmark import figures, lighting, methods, reference
+from mi_sparse_prt.benchmark.brute_force import time_rows
 from mi_sparse_prt.benchmark.direct_error import direct_error
-from mi_sparse_prt.benchmark.estimates import mean_square, relative_l2, row_errors
+from mi_sparse_prt.benchmark.estimates import joint_relative_l2, mean_square, relative_l2, row_errors
 from mi_sparse_prt.benchmark.lighting import RelitReference, environments_of, path_traced
 from mi_sparse_prt.benchmark.machine import kept_memory
 from mi_sparse_prt.benchmark.reference import Reference
@@ -43,7 +45,7 @@ SCENE = """<scene version="3.0.0">
 def quick(monkeypatch):
     """Small references: noisy, but all of their parts take part."""
     for module, values in (
-        (reference, {"VERTICES": 40, "TEXELS": 12, "ELEMENT_SPP": 64, "ROWS": 8, "ROW_SPP": 16}),
+        (reference, {"VERTICES": 120, "TEXELS": 12, "ELEMENT_SPP": 64, "ROWS": 24, "ROW_SPP": 16}),
         (lighting, {"VERTICES": 20, "PATHS": 1024, "ROTATIONS": 4}),
         (figures, {"PATHS": 64, "PIXEL_SAMPLES": 1, "WIDTH": 60}),
     ):
@@ -87,6 +89,27 @@ def test_standard_error_of_a_relative_error():
         value, deviation = relative_l2(*pair)
         values.append(value)
         deviations.append(deviation)
+    assert np.mean(deviations) == pytest.approx(np.std(values), rel=0.25)
+
+
+def test_error_of_two_meshes_together():
+    """Expected: the sums over all vertices; the standard error is that of the spread over independent samples, also
+    where errors and norms come from different vertices."""
+    rng = np.random.default_rng(3)
+    sizes, scales, counts = [1000, 3000], [0.2, 0.05], [(60, 60), (20, 60)]
+    values, deviations = [], []
+    for _ in range(200):
+        errors, norms = [], []
+        for scale, (k, m) in zip(scales, counts, strict=True):
+            error, norm = scale * rng.normal(size=(k, 1)), 1 + rng.random((m, 1))
+            errors.append(mean_square(0.0, np.zeros((k, 1)), error, error))
+            norms.append(mean_square(0.0, np.zeros((m, 1)), norm, norm))
+        value, deviation = joint_relative_l2(errors, norms, sizes)
+        values.append(value)
+        deviations.append(deviation)
+    mean_norm = 7 / 3  # of (1 + u)^2, u uniform
+    expected = np.sqrt((1000 * 0.2**2 + 3000 * 0.05**2) / (4000 * mean_norm))
+    assert np.sqrt(np.mean(np.square(values))) == pytest.approx(expected, rel=0.03)
     assert np.mean(deviations) == pytest.approx(np.std(values), rel=0.25)
 
 
@@ -251,26 +274,77 @@ def test_errors_of_brute_force(quick, grey_scene, small_lighting, brute_force):
         assert found["direct_rows"]["max"] == found["direct_columns"]["max"] == 0
 
 
-def test_brute_force_is_timed_on_successive_rows(quick, monkeypatch):
-    """Expected: whole wavefronts of successive vertices in order, all of a mesh that has no more; all rows count."""
+def test_errors_of_all_meshes_together(quick, grey_scene, small_lighting, brute_force):
+    """
+    Rationale: three ways to the error of path-traced light: elements of a matrix, of its paths, rows of the adjoint.
+    Expected: the total is that of all squared errors over all squared norms, so it lies between those of the meshes,
+        nearer to that of the mesh with more light; all agree with the variance of the paths that is known at every
+        element, within four standard errors.
+    Result: as expected.
+    """
+    measured = Reference(grey_scene, small_lighting, progress=False)
+    everyone = np.arange(grey_scene.n_vertices)
+    weights = small_lighting.solid_angles[:, None].astype(np.float64)
+    albedo = grey_scene.albedo[:, :1, None].astype(np.float64)
+    rows, adjoint = measured.paths(64, 5).rows(everyone), measured.adjoint(64).rows(everyone)
+    norm = ((albedo * (measured.direct.rows(everyone) + rows.mean * weights)) ** 2).sum(axis=(1, 2))
+
+    def expected(variance, ids):
+        noise = (albedo**2 * variance * weights**2).sum(axis=(1, 2))
+        return np.sqrt(noise[ids].sum() / norm[ids].sum())
+
+    for found, variance in (
+        (measured.relative_l2(brute_force), rows.variance),
+        (measured.relative_l2_of_paths(64), rows.variance),
+        (measured.relative_l2_of_adjoint(64), adjoint.variance),
+    ):
+        deviations = found["standard_error"]
+        assert list(found["meshes"]) == [mesh.name for mesh in grey_scene.meshes]
+        for mesh in grey_scene.meshes:
+            ids = everyone[mesh.vertices]
+            difference = found["meshes"][mesh.name] - expected(variance, ids)
+            assert abs(difference) < 4 * deviations["meshes"][mesh.name] + 0.002
+        assert abs(found["total"] - expected(variance, everyone)) < 4 * deviations["total"] + 0.002
+        assert 0 < deviations["total"] < found["total"]
+    assert 0 < measured.total_noise() < max(measured.noise().values())
+
+
+def test_brute_force_is_timed_on_successive_rows(monkeypatch):
+    """Expected: whole wavefronts of successive vertices, one in each eighth of the scene; or all, once, if few."""
     scene = build(edge_length=0.06, **still_life())
-    light = prt.CubemapLighting(4)
-    measured = Reference.__new__(Reference)
-    measured.scene, measured.lighting, measured.points = scene, light, vertex_points(scene)
-    measured.direct_seconds = 1.0
+    solver, n = (
+        PathTransport(scene.normalised, prt.CubemapLighting(4), vertex_points(scene)),
+        scene.n_vertices,
+    )
     traced = []
-    monkeypatch.setattr("mi_sparse_prt.benchmark.reference.TIMED_BLOCKS", 4)
-    monkeypatch.setattr(PathTransport, "block_size", 32)
-    monkeypatch.setattr(PathTransport, "rows", lambda solver, ids: traced.append(np.asarray(ids)))
-    report = measured.time_brute_force()
-    assert report["seconds"] == 1 + report["paths_seconds"]
-    timed = np.concatenate(traced[1:])
-    assert all((np.diff(ids) == 1).all() and len(ids) <= 32 for ids in traced)
-    for mesh in scene.meshes:
-        n = mesh.vertices.stop - mesh.vertices.start
-        own = timed[(timed >= mesh.vertices.start) & (timed < mesh.vertices.stop)]
-        assert report["rows"][mesh.name] == len(own) == len(set(own)) == (128 if n >= 128 else n)
-    assert {128} < {len(scene.positions), *report["rows"].values()}
+    monkeypatch.setattr(PathTransport, "rows", lambda _, ids: traced.append(np.asarray(ids)))
+    found = time_rows(solver, 32)
+    assert all((np.diff(ids) == 1).all() and len(ids) == 32 for ids in traced)
+    starts = np.array([ids[0] for ids in traced[1:]])
+    assert found.rows == 256 < n and len(starts) == 8
+    assert (np.abs(starts / n - (np.arange(8) + 0.5) / 8) < 0.5 / 8 + 64 / n).all()
+
+    traced.clear()
+    found = time_rows(solver, n // 3)
+    np.testing.assert_array_equal(np.concatenate(traced[1:]), np.arange(n))
+    assert found.rows == n and found.standard_error == 0
+
+
+def test_time_of_all_rows_from_some(monkeypatch):
+    """Expected: with a clock that every row moves on by its own amount, the sum over all rows within four errors."""
+    scene = build(edge_length=0.06, **still_life())
+    solver = PathTransport(scene.normalised, prt.CubemapLighting(4), vertex_points(scene))
+    clock = [0.0]
+    each = 1 + 0.3 * np.random.default_rng(0).random(scene.n_vertices)
+
+    def rows(_, ids):
+        clock[0] += each[ids].sum()
+
+    monkeypatch.setattr(PathTransport, "rows", rows)
+    monkeypatch.setattr(brute_force_times.time, "perf_counter", lambda: clock[0])
+    found = time_rows(solver, 8)
+    assert found.rows < scene.n_vertices / 4
+    assert abs(found.seconds - each.sum()) < 4 * found.standard_error < 0.1 * each.sum()
 
 
 # ---------------------------------------------------------------------------------------------------------- report
