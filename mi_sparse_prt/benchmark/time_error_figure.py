@@ -75,9 +75,15 @@ def time_error_figure(report: dict[str, Any], mesh: str | None = None) -> Figure
     )
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(FuncFormatter(_two_or_five))
     axes.grid(which="both", alpha=0.25)
     axes.legend(handles=shown, loc="upper left", bbox_to_anchor=(1, 1), fontsize="small")
     return figure
+
+
+def _two_or_five(value: float, _: int | None) -> str:
+    """Numbers beside a few of the lines between powers of ten: the axis may have a single one of these."""
+    return f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
 
 
 def _error(point: dict[str, Any], mesh: str | None) -> tuple[float, float]:

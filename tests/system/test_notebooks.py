@@ -38,6 +38,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "RADIUS_VERTICES": 20,
         "DIRECTIONS": 20,
     },
+    "03_time_against_error": {
+        "SCENE": "cornell",
+        "RESOLUTION": 4,
+        "EDGE_LENGTH": 1e9,
+        "REFERENCE_SPP": 64,
+        "METHODS": ["k_means_columns", "gather"],
+    },
 }
 
 
