@@ -10,7 +10,7 @@ import numpy as np
 from mi_sparse_prt.transport.adjoint import AdjointTransport
 from mi_sparse_prt.transport.path import PathTransport
 
-ROWS, BLOCKS = 128, 8  # at least
+ROWS, BLOCKS = 128, 16  # at least
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def time_rows(solver: PathTransport | AdjointTransport, size: int) -> RowsTime:
     Parameters
     ----------
     solver : PathTransport or AdjointTransport
-        At the scene's vertices, mesh after mesh. If there are less than eight blocks, all are timed.
+        At the scene's vertices, mesh after mesh. If there are fewer blocks, all are timed.
     size : int
         Vertices in a block: as many as a full run traces together.
     """
