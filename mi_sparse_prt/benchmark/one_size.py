@@ -84,7 +84,7 @@ def measured_apart(**arguments: Any) -> dict[str, Any]:
         What ``measure`` raises there, or if the process ends otherwise (killed because memory ran out).
     """
     done = subprocess.run(
-        [sys.executable, "-m", "mi_sparse_prt.benchmark.one_size", json.dumps(arguments)],
+        [sys.executable, "-c", f"from {__name__} import main; main()", json.dumps(arguments)],
         env=os.environ | {"MI_SPARSE_PRT_VARIANT": mi.variant()},
         stdout=subprocess.PIPE,
         text=True,
@@ -109,7 +109,3 @@ def main() -> None:
         except PrtError as error:
             found = {"refused": str(error)}
     json.dump(found, sys.stdout)
-
-
-if __name__ == "__main__":
-    main()
