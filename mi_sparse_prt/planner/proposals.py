@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mi_sparse_prt.planner.choice import TARGET, Costs, choose, finer, predictions
+from mi_sparse_prt.planner.choice import TARGET, Costs, choose, choose_first, finer, predictions
 from mi_sparse_prt.planner.plan import EFFORTS, Plan
 from mi_sparse_prt.settings import Settings
 
@@ -56,7 +56,9 @@ class Ranking:
     def __init__(self, costs: Costs, settings: Settings) -> None:
         self._costs, self._settings = costs, settings
         self._plans = predictions(costs, settings.target_error or TARGET, settings.spp)
-        self._best = choose(self._plans, settings.target_error)
+        # errors of paths are predicted too well for a trial to turn out better
+        begin = choose_first if settings.method == "auto" else choose
+        self._best = begin(self._plans, settings.target_error)
         self._tried = [self._best.plan]
 
     @property

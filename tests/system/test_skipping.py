@@ -275,7 +275,7 @@ def consensual(scene: prt.Scene, direct: DirectTransport) -> NDArray[np.uint32]:
 
 SPARSE = {
     "sparse": (by_sparse, 0.24),
-    "consensus": (consensual, 0.06),
+    "consensus": (consensual, 0.1),
 }  # and the share of vertices sampled first
 
 
