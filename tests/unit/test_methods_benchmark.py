@@ -310,7 +310,7 @@ def test_errors_of_all_meshes_together(quick, grey_scene, small_lighting, brute_
 
 
 def test_brute_force_is_timed_on_successive_rows(monkeypatch):
-    """Expected: whole wavefronts of successive vertices, one in each eighth of the scene; or all, once, if few."""
+    """Expected: whole wavefronts of successive vertices, one in each part of the scene; or all, once, if few."""
     scene = build(edge_length=0.06, **still_life())
     solver, n = (
         PathTransport(scene.normalised, prt.CubemapLighting(4), vertex_points(scene)),
@@ -321,8 +321,9 @@ def test_brute_force_is_timed_on_successive_rows(monkeypatch):
     found = time_rows(solver, 32)
     assert all((np.diff(ids) == 1).all() and len(ids) == 32 for ids in traced)
     starts = np.array([ids[0] for ids in traced[1:]])
-    assert found.rows == 256 < n and len(starts) == 8
-    assert (np.abs(starts / n - (np.arange(8) + 0.5) / 8) < 0.5 / 8 + 64 / n).all()
+    parts = brute_force_times.BLOCKS
+    assert found.rows == 32 * parts < n and len(starts) == parts
+    assert (np.abs(starts / n - (np.arange(parts) + 0.5) / parts) < 0.5 / parts + 64 / n).all()
 
     traced.clear()
     found = time_rows(solver, n // 3)
