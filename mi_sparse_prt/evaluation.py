@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+from mi_sparse_prt.bits import counts
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.matrix import LightTransport, MeshRange, Visibility
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -15,7 +16,7 @@ from mi_sparse_prt.methods.huang2010 import huang2010_parts
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.methods.sparse import sparse_parts
 from mi_sparse_prt.planner.plan import TOGETHER, Plan
-from mi_sparse_prt.sampling.bits import counts
+from mi_sparse_prt.reconstruction.nodes import choose_nodes
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -66,16 +67,7 @@ class Evaluation:
 
     def matrix(self, parts: Parts) -> LightTransport:
         """The matrix of evaluated parts, without a report."""
-        return LightTransport(
-            lighting=self._solver.lighting,
-            basis=self._solver.basis,
-            albedo=self._scene.albedo,
-            direct=parts.direct,
-            indirect=parts.indirect,
-            meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in self._scene.meshes),
-            vertex_keys=self._solver.points.keys,
-            scene_hash=self._scene.hash,
-        )
+        return matrix_of(self._scene, self._solver, parts)
 
     def _direct_light(self, how: str) -> Parts:
         """Direct light alone; it costs nothing the second time."""
@@ -112,8 +104,15 @@ class Evaluation:
         """With interreflections by finite elements."""
         solver, settings = self._solver, self._settings
         with self._clock.phase("gather_rays"):
+            nodes = choose_nodes(self._scene, solver.points)
             gather = GatherTransport(
-                self._scene, solver.lighting, solver.points, plan.rays, settings.max_depth, settings.seed
+                self._scene,
+                solver.lighting,
+                solver.points,
+                plan.rays,
+                settings.max_depth,
+                settings.seed,
+                nodes,
             )
         with self._clock.phase("interreflection"):
             part = gather.indirect(light.direct, plan.tolerance)
@@ -161,6 +160,20 @@ class Evaluation:
             + self._solver.points.keys.tobytes()
         )
         return Path(self._folder) / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
+
+
+def matrix_of(scene: Scene, direct: DirectTransport, parts: Parts) -> LightTransport:
+    """The matrix of parts that were evaluated at a scene's vertices, without a report."""
+    return LightTransport(
+        lighting=direct.lighting,
+        basis=direct.basis,
+        albedo=scene.albedo,
+        direct=parts.direct,
+        indirect=parts.indirect,
+        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+        vertex_keys=direct.points.keys,
+        scene_hash=scene.hash,
+    )
 
 
 def indirect_solver(scene: Scene, settings: Settings) -> PathTransport:

@@ -12,8 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS, bit_of
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.sampling.bits import BITS
 
 FULL = 255  # a share of 1
 _PARTS = 256  # of a face per axis, over which directions are averaged
@@ -233,9 +233,3 @@ def _single(
             share = np.float32(bit_of(bits[i], j))
         result[m] = share * _mean_cosine(cosine, ramps[j]) * weights[j]
     return result
-
-
-@numba.njit
-def bit_of(words: NDArray[np.uint32], texel: int) -> np.uint32:
-    """One bit of a row, 0 or 1."""
-    return (words[texel // BITS] >> np.uint32(texel % BITS)) & np.uint32(1)

@@ -16,13 +16,14 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
+from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
+from mi_sparse_prt.transport.direct import FIXED_POINT
 
 Rows = NDArray[np.integer]
 

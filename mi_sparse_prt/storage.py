@@ -18,6 +18,7 @@ import scipy.sparse
 import zarr
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
@@ -30,7 +31,6 @@ from mi_sparse_prt.matrix import (
     MeshRange,
     Visibility,
 )
-from mi_sparse_prt.transport.direct import BITS
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 4

@@ -22,7 +22,8 @@ from mi_sparse_prt.benchmark.columns import (
 )
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.evaluation import matrix_of
+from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense import Dense
 from mi_sparse_prt.methods.huang2010 import huang2010_parts
@@ -69,21 +70,13 @@ def precompute_with_columns(
         return _of_nearest(scene, dense, mean, CHOICES[choice], seed)
 
     parts = huang2010_parts(scene, direct, paths, seed, clock, progress, columns=columns)
-    return LightTransport(
-        lighting=lighting,
-        basis="direction",
-        albedo=scene.albedo,
-        direct=parts.direct,
-        indirect=parts.indirect,
-        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-        vertex_keys=points.keys,
-        scene_hash=scene.hash,
-        report={
-            "seconds": clock.report(),
-            "elements_total": len(points) * lighting.n_directions,
-            "elements_evaluated": parts.elements_evaluated,
-        },
+    transport = matrix_of(scene, direct, parts)
+    transport.report.update(
+        seconds=clock.report(),
+        elements_total=len(points) * lighting.n_directions,
+        elements_evaluated=parts.elements_evaluated,
     )
+    return transport
 
 
 def _of_nearest(

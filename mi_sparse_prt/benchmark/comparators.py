@@ -21,6 +21,7 @@ from mi_sparse_prt.benchmark.columns import (
     regions,
 )
 from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.bits import Bits
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -34,7 +35,6 @@ from mi_sparse_prt.reconstruction.neighbours import (
 )
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits
 from mi_sparse_prt.sampling.features import best_features
 from mi_sparse_prt.sampling.spatial import choose_dense, weighted_choice
 from mi_sparse_prt.scene import Scene

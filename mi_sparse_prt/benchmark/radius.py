@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.bits import Bits
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
@@ -21,7 +22,6 @@ from mi_sparse_prt.reconstruction.l1 import l1_fit, least_squares_fit
 from mi_sparse_prt.reconstruction.neighbours import radius_neighbours
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits
 from mi_sparse_prt.sampling.features import best_features
 from mi_sparse_prt.sampling.spatial import weighted_choice
 from mi_sparse_prt.scene import Mesh, Scene

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -46,13 +47,22 @@ class Points:
         return len(self.positions)
 
 
+_KNOWN: WeakKeyDictionary[Scene, Points] = WeakKeyDictionary()
+
+
 def vertex_points(scene: Scene) -> Points:
-    """Return the scene's vertices as measurement points.
+    """Return the scene's vertices as measurement points; the same ones each time.
 
     Vertices on the border of a mesh stand for the surface inside of it and are moved there by a few ray offsets (5e-4
     of the scene's longest side). Exactly on the border, where another surface often begins (the corners of a room, a
     box on the ground), their rays would start in that surface and leak through it.
     """
+    if scene not in _KNOWN:
+        _KNOWN[scene] = _vertex_points(scene)
+    return _KNOWN[scene]
+
+
+def _vertex_points(scene: Scene) -> Points:
     positions = scene.normalised_positions
     triangles = np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
     border, centre = _centres_beside_border(positions, triangles)

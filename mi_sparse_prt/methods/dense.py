@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.bits import Bits
 from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
-from mi_sparse_prt.sampling.bits import Bits
 from mi_sparse_prt.sampling.spatial import choose_dense
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport

@@ -16,6 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.bits import counts, pack
 from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.errors import PrtError
@@ -26,7 +27,6 @@ from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.neighbours import radius_neighbours
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import counts, pack
 from mi_sparse_prt.sampling.features import best_features
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport

@@ -15,6 +15,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.bits import Bits, listed, pack
 from mi_sparse_prt.checkpoint import Checkpoint
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.hashing import mix
@@ -26,7 +27,6 @@ from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights
 from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
 from mi_sparse_prt.reconstruction.systems import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits, listed, pack
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.path import PathTransport
 

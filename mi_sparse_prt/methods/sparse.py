@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import counts, pack
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.matrix import Interpolated, Visibility
 from mi_sparse_prt.methods.dense import Dense, DenseSampler
@@ -22,7 +23,6 @@ from mi_sparse_prt.methods.indirect import indirect_part
 from mi_sparse_prt.methods.neighbourhoods import neighbourhoods
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import counts, pack
 from mi_sparse_prt.sampling.consensus import Consensus
 from mi_sparse_prt.scene import Mesh, Scene
 from mi_sparse_prt.transport.direct import DirectTransport

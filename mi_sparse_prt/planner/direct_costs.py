@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mi_sparse_prt.bits import Bits, counts, listed, unpack
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.planner.timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import Bits, counts, listed, unpack
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
@@ -23,9 +23,7 @@ from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
-INNER = (
-    4  # one in so many vertices of a patch is judged: those in the middle, which have all their neighbours
-)
+INNER = 4  # one in so many vertices of a patch is judged: the middle ones, which have all their neighbours
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 

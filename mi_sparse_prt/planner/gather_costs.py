@@ -13,10 +13,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.reconstruction.nodes import NODES
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.first_bounce import FEW_ROWS, MIXED, ROWS
-from mi_sparse_prt.transport.gather import NODES
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
 from mi_sparse_prt.transport.sparse_product import product
 from mi_sparse_prt.validation.pilot_elements import PilotElements

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import above_horizon, listed, overwrite
+from mi_sparse_prt.measurement.curve import along_curve
 from mi_sparse_prt.reconstruction.neighbours import renumbered, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import above_horizon, listed, overwrite
 from mi_sparse_prt.sampling.features import contested, copy_agreed
 
 STRIDES = (12, 4, 2, 1)  # one vertex in so many is known after each level; each divides the one before
@@ -64,14 +65,16 @@ class Consensus:
         self.repair(vertices, near)
 
     def repair(self, vertices: Ids, near: NDArray[np.int32]) -> None:
-        """Trace where neighbours (n, k) of vertices (n,) disagree, and no ray has been traced."""
+        """Trace where neighbours (n, k) of vertices (n,) disagree, and no ray has been traced.
+
+        All are compared before any is changed: the order of vertices and the size of blocks do not matter.
+        """
+        asked = contested(near, self.visible, self.above, vertices, self.above, self.evaluated)
         for a in range(0, len(vertices), BLOCK):
-            some = vertices[a : a + BLOCK]
-            asked = contested(near[a : a + BLOCK], self.visible, self.above, some, self.above, self.evaluated)
-            rows, texels = listed(asked)
-            overwrite(
-                self.visible, self.evaluated, some, asked, self._trace(some.astype(np.uint32)[rows], texels)
-            )
+            some, bits = vertices[a : a + BLOCK], asked[a : a + BLOCK]
+            rows, texels = listed(bits)
+            values = self._trace(some.astype(np.uint32)[rows], texels)
+            overwrite(self.visible, self.evaluated, some, bits, values)
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ class Surface:
 
     def levels(self) -> list[Ids]:
         """Its vertices (counted from 0) in levels, each spread evenly; independent of the order in which they come."""
-        order = np.lexsort((self.keys, _morton(self.positions)))
+        order = along_curve(self.positions, self.keys)
         level = np.full(len(order), len(STRIDES) - 1)
         for number, stride in reversed(list(enumerate(STRIDES))):
             level[::stride] = number
@@ -119,33 +122,5 @@ def by_levels(state: Consensus, surface: Surface) -> None:
         state.sample(surface.first + new[lonely])
         state.agree(surface.first + new[~lonely], renumbered(near[~lonely], surface.first + known))
         known = np.concatenate([known, new])
-    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[
-        :, 1:
-    ]  # the first is the vertex itself
+    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[:, 1:]  # without itself
     state.repair(surface.first + known, renumbered(around, surface.first + np.arange(len(p))))
-
-
-def _morton(positions: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """Places (n,) of positions (n, 3) along Morton's curve through their box, 21 bits per axis."""
-    p = np.asarray(positions, np.float64)
-    if not len(p):
-        return np.zeros(0, np.uint64)
-    low, side = p.min(axis=0), float(np.ptp(p, axis=0).max())
-    cells = ((p - low) / max(side, 1e-30) * (2**21 - 1)).astype(np.uint64)
-    code = np.zeros(len(p), np.uint64)
-    for axis in range(3):
-        x = cells[:, axis]
-        for shift, mask in _SPREAD:
-            x = (x | x << np.uint64(shift)) & np.uint64(mask)
-        code |= x << np.uint64(axis)
-    return code
-
-
-# how bits of a number are moved apart, two empty places between them
-_SPREAD = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.transport.lanes import PointArrays, TexelArrays, random_generator, start_ray
 
-BITS = 32
 FIXED_POINT = 65535.0  # mean cosines in [0, 1] as 16-bit fixed point: an absolute error of 8e-6
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
 

@@ -8,9 +8,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.matrix import MeanCosine, Part, Visibility
-from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
+from mi_sparse_prt.transport.direct import FIXED_POINT
 
 BLOCK = 1 << 22  # elements at a time; 16 MB stay in the cache until they are used
 

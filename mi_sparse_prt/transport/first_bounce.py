@@ -83,14 +83,11 @@ def first_bounce(
     -------
     LowRank
     """
-    rng, hashes = (
-        np.random.default_rng(seed),
-        mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64))),
-    )
+    rng = np.random.default_rng(seed)
+    hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
     columns, turn, missed = _basis(matrix, albedo, DirectColumns(direct, lighting), hashes, rng, tolerance)
-    rows, probability = _chosen_rows(
-        _leverage(columns, turn, rng), hashes, _row_count(turn.shape[1], len(keys))
-    )
+    count = _row_count(turn.shape[1], len(keys))
+    rows, probability = _chosen_rows(_leverage(columns, turn, rng), hashes, count)
     some = columns[rows].astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
@@ -120,9 +117,8 @@ def _basis(
         block = _combinations(matrix, albedo, light, rng)
         new = (block if shorten is None else product(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
-        known = turn.T @ np.concatenate(
-            [np.zeros((0, new.shape[1])), *products[:-1]]
-        )  # [vector, combination]
+        # [vector, combination]
+        known = turn.T @ np.concatenate([np.zeros((0, new.shape[1])), *products[:-1]])
         rest = products[-1] - known.T @ known
         energies.append(np.trace(products[-1]))
         energy = max(float(np.mean(energies)), 1e-30)

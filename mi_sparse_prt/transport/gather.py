@@ -28,14 +28,11 @@ from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.direct_columns import DirectColumns
 from mi_sparse_prt.transport.first_bounce import LowRank, all_but_least, first_bounce
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
-from mi_sparse_prt.transport.gather_nodes import choose_nodes
+from mi_sparse_prt.transport.nodes import Nodes
 from mi_sparse_prt.transport.sparse_product import gathered, product
 
-NODES = 1 << 16
 COLUMNS = 256  # of a dense matrix that G is applied to at a time
-LATER = (
-    0.25  # of the squared tolerance: what each later bounce may leave out of the light that it starts from
-)
+LATER = 0.25  # of the squared tolerance: what a later bounce may leave out of the light that it starts from
 NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
 LONGEST = 1024  # bounces after which light is taken not to end
 
@@ -73,8 +70,8 @@ class GatherTransport:
         As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
         nothing are left out.
     seed : int
-    most_nodes : int
-        Where there are more vertices, about so many of them gather light, and others interpolate theirs.
+    nodes : Nodes, optional
+        The vertices that gather light, others interpolate theirs; all if not given.
 
     Attributes
     ----------
@@ -101,14 +98,14 @@ class GatherTransport:
         rays_per_vertex: int = 256,
         max_depth: int = 5,
         seed: int = 0,
-        most_nodes: int = NODES,
+        nodes: Nodes | None = None,
     ) -> None:
         _check_diffuse(scene)
         self.lighting, self.max_depth, self.seed = lighting, max_depth, seed
         self.channels = 1 if scene.grey else 3
         self._albedo = np.ascontiguousarray(scene.albedo.T[: self.channels])  # [channel, vertex]
         self._keys = points.keys
-        self.nodes = choose_nodes(scene, points, most_nodes)
+        self.nodes = nodes or Nodes(np.arange(len(points)), None)
         self.rays = len(self.nodes) * rays_per_vertex
         self.matrix = gather_matrix(scene, points, rays_per_vertex, seed, self.nodes.ids)
 

@@ -19,8 +19,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.fractional_visibility import FULL, FractionalVisibility, bit_of
-from mi_sparse_prt.sampling.bits import BITS, Bits, above_horizon, counts, listed, lowest
+from mi_sparse_prt.bits import BITS, Bits, above_horizon, bit_of, counts, listed, lowest
+from mi_sparse_prt.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.texel_sides import Sides, TexelSides
 
@@ -145,10 +145,9 @@ def _find_shares(
     Texels that the horizon may cut, their centres below it, are seen as those around them are; ``seen`` says so.
     """
     for thread in numba.prange(threads):
-        edge = np.full(
-            len(sides.first), -1.0, np.float32
-        )  # [pair]: where visibility changes between its texels
-        done = np.full(len(sides.beside), -1, np.int64)  # [texel]: the last vertex that it was cut for
+        # where visibility changes between the texels of each pair, and for which vertex each texel was cut last
+        edge = np.full(len(sides.first), -1.0, np.float32)
+        done = np.full(len(sides.beside), -1, np.int64)
         for i in range(thread, len(bits), threads):
             at, own = room[i], range(crossings.starts[i], crossings.starts[i + 1])
             for e in own:

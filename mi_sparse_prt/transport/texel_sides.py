@@ -13,9 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS, Bits, bit_of, pack
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
-from mi_sparse_prt.fractional_visibility import bit_of
-from mi_sparse_prt.sampling.bits import BITS, Bits, pack
 
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))

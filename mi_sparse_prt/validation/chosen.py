@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mi_sparse_prt.bits import Bits, bit_of
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import LightTransport, Visibility
-from mi_sparse_prt.sampling.bits import Bits
-from mi_sparse_prt.transport.direct import BITS
 from mi_sparse_prt.validation.elements import elements
 
 RAYS = 0.002  # of the elements of a mesh, for direct light ...
@@ -189,9 +188,9 @@ def _near_edges(
     near = np.zeros(len(vertices), np.bool_)
     for e in numba.prange(len(vertices)):
         i = vertices[e]
-        own = _bit(bits[i], texels[e])
+        own = bit_of(bits[i], texels[e])
         for j in around[texels[e]]:
-            if _bit(bits[i], j) != own:
+            if bit_of(bits[i], j) != own:
                 cosine = 0.0
                 for d in range(3):
                     cosine += normals[i, d] * directions[j, d]
@@ -199,8 +198,3 @@ def _near_edges(
                     near[e] = True
                     break
     return near
-
-
-@numba.njit
-def _bit(words: Bits, texel: int) -> int:
-    return (words[texel // BITS] >> np.uint32(texel % BITS)) & np.uint32(1)

@@ -6,9 +6,10 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
-from mi_sparse_prt.transport.direct import BITS, FIXED_POINT
+from mi_sparse_prt.transport.direct import FIXED_POINT
 
 BLOCK = (
     1 << 15

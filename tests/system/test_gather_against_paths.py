@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt.matrix import MeanCosine
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.transport import gather_nodes
+from mi_sparse_prt.reconstruction import nodes as nodes_module
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.gather import GatherTransport
 from mi_sparse_prt.transport.path import PathTransport
@@ -106,8 +106,9 @@ def test_an_integrating_sphere(artefact, monkeypatch):
     axes.set(xlabel="height", ylabel="irradiance / pi")
     axes.legend()
     artefact(figure)
-    monkeypatch.setattr(gather_nodes, "SMALL", 1000)
-    some = GatherTransport(scene, lighting, points, 256, max_depth=-1, most_nodes=1000)
+    monkeypatch.setattr(nodes_module, "SMALL", 1000)
+    nodes = nodes_module.choose_nodes(scene, points, 1000)
+    some = GatherTransport(scene, lighting, points, 256, max_depth=-1, nodes=nodes)
     value = even[:, 0] + some.apply(even)[:, 0, 0]
     print(
         f"{len(some.nodes)} nodes of {len(points)} vertices: {value[wall].mean():.5f}, known {f / (1 - q):.5f}"

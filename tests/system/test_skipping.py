@@ -11,12 +11,12 @@ from conftest import COLOURS, GREY, T, build, bumpy_ball, diffuse, mesh, still_l
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import unpack
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.consensus import by_consensus
 from mi_sparse_prt.methods.sparse import sparse_parts
-from mi_sparse_prt.sampling.bits import unpack
 from mi_sparse_prt.settings import METHODS
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.gather import GatherTransport

@@ -9,8 +9,8 @@ from conftest import T, build, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import unpack
 from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.sampling.bits import unpack
 from mi_sparse_prt.scene import Scene
 
 LIGHTING = prt.CubemapLighting(8)
@@ -108,6 +108,7 @@ def test_block_size(monkeypatch):
     for lanes in (1 << 22, 1 << 14):
         monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", lanes)
         monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", lanes)
+        monkeypatch.setattr("mi_sparse_prt.sampling.consensus.BLOCK", lanes >> 8)
         whole, parts = (
             parts,
             rows(prt.precompute(scene("home"), LIGHTING, "sparse", max_depth=4, spp=4, progress=False)),

@@ -12,9 +12,9 @@ from conftest import COLOURS, GREY, T, build, diffuse, made_up, mesh, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import unpack
 from mi_sparse_prt.matrix import Interpolated, LightTransport, Visibility
 from mi_sparse_prt.methods.huang2010 import whole_rows
-from mi_sparse_prt.sampling.bits import unpack
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.path import PathTransport
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt.matrix import MeanCosine
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_points, vertex_rays
-from mi_sparse_prt.transport import gather_nodes
+from mi_sparse_prt.reconstruction import nodes as nodes_module
 from mi_sparse_prt.transport.adjoint import AdjointTransport
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.gather import GatherTransport
@@ -264,11 +264,11 @@ def test_inner_product_of_finite_elements(coloured_scene, monkeypatch, most_node
 
     Expected: equal but for rounding, 1e-5 of the same sum over |m|.
     """
-    monkeypatch.setattr(gather_nodes, "SMALL", 50)
+    monkeypatch.setattr(nodes_module, "SMALL", 50)
     lighting, rng = prt.CubemapLighting(4), np.random.default_rng(3)
-    gather = GatherTransport(
-        coloured_scene, lighting, vertex_points(coloured_scene), 64, most_nodes=most_nodes
-    )
+    points = vertex_points(coloured_scene)
+    nodes = nodes_module.choose_nodes(coloured_scene, points, most_nodes)
+    gather = GatherTransport(coloured_scene, lighting, points, 64, nodes=nodes)
     assert (len(gather.nodes) < 200) == (most_nodes == 150)
     direct = direct_part(coloured_scene, lighting)
     rows = gather.rows(direct, np.arange(coloured_scene.n_vertices)).astype(np.float64)

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import counts, unpack
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
-from mi_sparse_prt.sampling.bits import counts, unpack
 
 GRIDS = {n: AngularGrid(prt.CubemapLighting(n)) for n in (1, 2, 4, 8, 16)}
 UP = np.float32([[0, 1, 0]])

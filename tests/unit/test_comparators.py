@@ -30,6 +30,7 @@ from mi_sparse_prt.benchmark.comparators import (
     plot_choices,
 )
 from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.bits import pack, unpack
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -37,7 +38,6 @@ from mi_sparse_prt.methods.dense import DenseSampler
 from mi_sparse_prt.methods.huang2010 import RELATIVE_LAMBDA
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import pack, unpack
 from mi_sparse_prt.transport.direct import DirectTransport
 
 RESOLUTION, VERTICES = 8, 40

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mi_sparse_prt import CubemapLighting
+from mi_sparse_prt.bits import unpack
+from mi_sparse_prt.sampling import consensus
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.bits import unpack
 from mi_sparse_prt.sampling.consensus import STRIDES, Consensus, Surface, by_levels
 
 LIGHTING = CubemapLighting(16)
@@ -85,6 +86,14 @@ def test_the_order_of_vertices_does_not_matter():
     a, b = plane.state(), shuffled.state()
     np.testing.assert_array_equal(a.visible[shuffled.order], b.visible)
     np.testing.assert_array_equal(a.evaluated[shuffled.order], b.evaluated)
+
+
+def test_the_size_of_blocks_does_not_matter(monkeypatch):
+    whole = Plane().state()
+    monkeypatch.setattr(consensus, "BLOCK", 7)
+    parts = Plane().state()
+    np.testing.assert_array_equal(whole.visible, parts.visible)
+    np.testing.assert_array_equal(whole.evaluated, parts.evaluated)
 
 
 def test_levels_are_a_partition_and_each_is_spread_evenly():

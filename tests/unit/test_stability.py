@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import pack, unpack
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.reconstruction.l1 import l1_fit, least_squares_fit
 from mi_sparse_prt.reconstruction.low_rank import denoised
 from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
 from mi_sparse_prt.reconstruction.systems import normal_equations
-from mi_sparse_prt.sampling.bits import pack, unpack
 from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
 from mi_sparse_prt.sampling.spatial import local_rank
 from mi_sparse_prt.scene import Scene

@@ -11,11 +11,11 @@ import pytest
 from conftest import build, bumpy_ball, diffuse, mesh
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.bits import above_horizon, pack, unpack
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import MeanCosine, Visibility
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.sampling.bits import above_horizon, pack, unpack
 from mi_sparse_prt.transport import texel_edges
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.texel_edges import STEPS, _cut_off, _quadrant, fractional_visibility

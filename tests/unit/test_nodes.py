@@ -6,10 +6,10 @@ from conftest import COLOURS, build, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.reconstruction import nodes as nodes_module
+from mi_sparse_prt.reconstruction.nodes import choose_nodes
 from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport import gather_nodes
 from mi_sparse_prt.transport.gather import GatherTransport
-from mi_sparse_prt.transport.gather_nodes import choose_nodes
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def scene() -> Scene:
 
 @pytest.fixture(autouse=True)
 def _few(monkeypatch) -> None:
-    monkeypatch.setattr(gather_nodes, "SMALL", 200)
+    monkeypatch.setattr(nodes_module, "SMALL", 200)
 
 
 def test_small_meshes_keep_all_vertices(scene):
@@ -72,7 +72,7 @@ def test_the_result_does_not_depend_on_the_order_of_shapes(scene):
     def found(some: Scene) -> tuple[np.ndarray, np.ndarray]:
         points = vertex_points(some)
         order = np.argsort(points.keys)
-        gather = GatherTransport(some, lighting, points, 64, most_nodes=800)
+        gather = GatherTransport(some, lighting, points, 64, nodes=choose_nodes(some, points, 800))
         light = np.maximum(some.normals[:, 1:2], 0)
         return np.sort(points.keys[gather.nodes.ids]), gather.apply(light)[order, 0]
 
@@ -87,7 +87,8 @@ def test_fewer_nodes_fewer_rays_and_nearly_the_same_light(scene):
     """A quarter of the vertices of the larger meshes: indirect light within 8% of that of all, the mean within 1%."""
     points, lighting = vertex_points(scene), prt.CubemapLighting(2)
     light = np.maximum(0.5 + 0.5 * scene.normals[:, 1:2], 0)
-    every, some = (GatherTransport(scene, lighting, points, 256, most_nodes=most) for most in (10**6, 800))
+    every = GatherTransport(scene, lighting, points, 256)
+    some = GatherTransport(scene, lighting, points, 256, nodes=choose_nodes(scene, points, 800))
     assert some.rays == 256 * len(some.nodes) < 0.6 * every.rays
     known, found = every.apply(light), some.apply(light)
     assert np.linalg.norm(found - known) < 0.08 * np.linalg.norm(known)

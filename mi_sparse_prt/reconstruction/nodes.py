@@ -1,57 +1,23 @@
-"""Where indirect light is found, if there are more vertices than it needs: at nodes, among which it is interpolated."""
+"""Nodes for indirect light, where there are more vertices than it needs, and its interpolation between them."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.measurement.curve import along_curve
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.neighbours import linear_weights, surface_neighbours
 from mi_sparse_prt.scene import Mesh, Scene
-from mi_sparse_prt.transport.sparse_product import product
+from mi_sparse_prt.transport.nodes import Nodes
 
+NODES = 1 << 16  # of a scene
 SMALL = 4096  # vertices of a mesh, of which none is left out
 NEIGHBOURS = 8  # nodes from which a vertex takes its light
-BITS = 21  # of a coordinate in Morton's order
 
 
-@dataclass(frozen=True)
-class Nodes:
-    """Vertices with light of their own, and weights of these for all vertices.
-
-    Attributes
-    ----------
-    ids : (n,) int64
-        Sorted.
-    weights : (n_v, n) sparse float32, or None
-        Rows sum to 1. None where all vertices are nodes.
-    """
-
-    ids: NDArray[np.int64]
-    weights: scipy.sparse.csr_array | None
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Light (n, k) of the nodes, interpolated at all vertices (n_v, k)."""
-        return light if self.weights is None else product(self.weights, light)
-
-    def collect(self, weights: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The transpose of ``spread``: weights of all vertices (n_v, k) as weights of nodes (n, k)."""
-        return weights if self.weights is None else product(self._transposed, weights)
-
-    @cached_property
-    def _transposed(self) -> scipy.sparse.csr_array:
-        assert self.weights is not None
-        return self.weights.T.tocsr()
-
-
-def choose_nodes(scene: Scene, points: Points, most: int) -> Nodes:
+def choose_nodes(scene: Scene, points: Points, most: int = NODES) -> Nodes:
     """About ``most`` vertices, evenly spread among those of each mesh; all of small meshes.
 
     Which ones depends on where vertices are and on their keys, not on their order.
@@ -92,7 +58,7 @@ def _of_mesh(
         return np.arange(inside.start, inside.stop), scipy.sparse.eye_array(
             wanted, dtype=np.float32, format="csr"
         )
-    order = np.lexsort((points.keys[inside], _morton(p)))
+    order = along_curve(p, points.keys[inside])
     # the middle one of each of so many stretches along the curve
     nodes = order[(2 * np.arange(wanted) + 1) * len(p) // (2 * wanted)]
     near = surface_neighbours(p, n, p[nodes], n[nodes], NEIGHBOURS)
@@ -107,14 +73,3 @@ def _of_mesh(
     entries = weights[present], rank[near.ids[present]], starts
     block = scipy.sparse.csr_array(entries, shape=(len(p), len(nodes)))
     return inside.start + np.sort(nodes), block
-
-
-def _morton(positions: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """Places (n,) of positions (n, 3) along Morton's curve through their box."""
-    low = positions.min(axis=0)
-    cells = (positions - low) / max(float(np.ptp(positions, axis=0).max()), 1e-30) * ((1 << BITS) - 1)
-    result = np.zeros(len(positions), np.uint64)
-    for axis, cell in enumerate(cells.astype(np.uint64).T):
-        for bit in range(BITS):
-            result |= (cell >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return result

@@ -71,6 +71,12 @@ def lowest(typingctx: Any, word: Any) -> Any:
     return word(word), generate
 
 
+@numba.njit
+def bit_of(words: Bits, direction: int) -> np.uint32:
+    """One bit of a row, 0 or 1."""
+    return (words[direction // BITS] >> np.uint32(direction % BITS)) & np.uint32(1)
+
+
 @numba.njit(parallel=True, cache=True)
 def counts(bits: Bits) -> NDArray[np.int64]:
     """Number of set bits in each row, (n,)."""
