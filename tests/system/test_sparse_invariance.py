@@ -108,7 +108,7 @@ def test_block_size(monkeypatch):
     for lanes in (1 << 22, 1 << 14):
         monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", lanes)
         monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", lanes)
-        monkeypatch.setattr("mi_sparse_prt.sampling.consensus.BLOCK", lanes >> 8)
+        monkeypatch.setattr("mi_sparse_prt.sampling.consensus.BLOCK", lanes >> 12)
         whole, parts = (
             parts,
             rows(prt.precompute(scene("home"), LIGHTING, "sparse", max_depth=4, spp=4, progress=False)),
