@@ -60,16 +60,12 @@ class Evaluation:
         """The parts of the matrix, and an account of what was evaluated for them by this call."""
         if plan.direct in TOGETHER:
             return self._together(plan)
-        light = self._direct_light(plan.direct)
+        light = self.direct_light(plan.direct)
         if plan.indirect == "none" or not self._any_indirect:
             return light
         return self._gathered(plan, light) if plan.indirect == "gather" else self._path_traced(plan, light)
 
-    def matrix(self, parts: Parts) -> LightTransport:
-        """The matrix of evaluated parts, without a report."""
-        return matrix_of(self._scene, self._solver, parts)
-
-    def _direct_light(self, how: str) -> Parts:
+    def direct_light(self, how: str) -> Parts:
         """Direct light alone; it costs nothing the second time."""
         if how in self._direct:
             return replace(
@@ -81,6 +77,10 @@ class Evaluation:
         find = {"exact": self._exact, "edges": self._edges, "consensus": self._consensus}[how]
         self._direct[how] = find()
         return self._direct[how]
+
+    def matrix(self, parts: Parts) -> LightTransport:
+        """The matrix of evaluated parts, without a report."""
+        return matrix_of(self._scene, self._solver, parts)
 
     def _exact(self) -> Parts:
         return exact_direct(self._solver, self._scene, self._clock, self._progress)

@@ -17,6 +17,7 @@ from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.plan import Plan
@@ -26,7 +27,8 @@ from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.validation.held_out import held_out_error
 
-_JUDGES = 1 << 20  # seeds of held-out elements that decide
+_JUDGES = 1 << 20  # seeds of held-out elements that decide ...
+_DIRECT_JUDGE = _JUDGES << 1  # ... and of those that direct light alone is judged by
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 
 
@@ -115,14 +117,17 @@ def precompute(
     proposals = _proposals(scene, direct, settings, reason is None, clock)
     with clock.phase("pilot"):
         expected = forecast(scene, direct, settings, proposals.plan, reason is None, proposals.seconds)
+    evaluation = Evaluation(scene, direct, settings, reason is None, clock, progress, checkpoint_folder)
+    tried = _tried_direct(evaluation, proposals, scene, settings, clock)
+    if tried:
+        expected = forecast(scene, direct, settings, proposals.plan, reason is None, proposals.seconds)
     if progress:
         tqdm.write(_expectation(scene, lighting, expected))
-    evaluation = Evaluation(scene, direct, settings, reason is None, clock, progress, checkpoint_folder)
-    parts = _attempted(evaluation, proposals, scene, settings, clock)
+    parts = _attempted(evaluation, proposals, tried, scene, settings, clock)
     transport = evaluation.matrix(parts)
     with clock.phase("held_out"):
         error = held_out_error(scene, transport, max_depth, seed)
-    _warn_if_missed(error, target_error)
+    _warn_if_missed(error, target_error, proposals.too_long)
     transport.report.update(
         _evaluated(parts, points, lighting, _skipped(scene, reason))
         | {"estimated_error": error, "plans": proposals.report(), "forecast": expected}
@@ -164,18 +169,33 @@ def _proposals(
     return Ranking(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
 
 
+def _tried_direct(
+    evaluation: Evaluation, proposals: Ladder | Ranking, scene: Scene, settings: Settings, clock: Stopwatch
+) -> list[Parts]:
+    """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
+    if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
+        return []
+    parts = evaluation.direct_light(how)
+    with clock.phase("held_out"):
+        found = held_out_error(scene, evaluation.matrix(parts), 2, settings.seed + _DIRECT_JUDGE)
+    proposals.judged(how, found["total"])
+    return [parts]
+
+
 def _attempted(
     evaluation: Evaluation,
     proposals: Ladder | Ranking,
+    tried: list[Parts],
     scene: Scene,
     settings: Settings,
     clock: Stopwatch,
 ) -> Parts:
     """The first of some attempts that meets the target error, or the last; where there is no target, the first.
 
-    Each attempt is judged by held-out elements of its own; those of the report decide nothing.
+    Each attempt is judged by held-out elements of its own; those of the report decide nothing. What was evaluated
+    before counts as well.
     """
-    attempts = [evaluation.parts(proposals.plan)]
+    attempts = [*tried, evaluation.parts(proposals.plan)]
     while settings.target_error is not None:
         judge = settings.seed + _JUDGES + len(attempts) - 1
         with clock.phase("held_out"):
@@ -204,13 +224,18 @@ def _with_costs_of(attempts: list[Parts]) -> Parts:
     )
 
 
-def _warn_if_missed(error: dict[str, Any], target: float | None) -> None:
-    if target is not None and error["total"] - 2 * error["standard_error"]["total"] > target:
-        warnings.warn(
-            f"the target error {target:g} was not met: the estimate is {error['total']:.3g}",
-            PrtWarning,
-            stacklevel=3,
-        )
+def _warn_if_missed(error: dict[str, Any], target: float | None, too_long: Predicted | None) -> None:
+    if target is None or error["total"] - 2 * error["standard_error"]["total"] <= target:
+        return
+    more = ""
+    if too_long is not None:
+        method = {"paths": "brute_force"}.get(too_long.plan.indirect, too_long.plan.indirect)
+        more = f'; method="{method}" would meet it in about {too_long.seconds / 60:.0f} min'
+    warnings.warn(
+        f"the target error {target:g} was not met: the estimate is {error['total']:.3g}{more}",
+        PrtWarning,
+        stacklevel=3,
+    )
 
 
 def _expectation(scene: Scene, lighting: CubemapLighting, expected: dict[str, float]) -> str:

@@ -2,8 +2,16 @@
 
 from mi_sparse_prt.benchmark.choices import measure_choices
 from mi_sparse_prt.benchmark.methods import measure_methods
+from mi_sparse_prt.benchmark.plans import measure_plans
 from mi_sparse_prt.benchmark.sizes import cost_against_size
 from mi_sparse_prt.benchmark.speed import run_benchmark
 from mi_sparse_prt.benchmark.time_error import time_against_error
 
-__all__ = ["cost_against_size", "measure_choices", "measure_methods", "run_benchmark", "time_against_error"]
+__all__ = [
+    "cost_against_size",
+    "measure_choices",
+    "measure_methods",
+    "measure_plans",
+    "run_benchmark",
+    "time_against_error",
+]

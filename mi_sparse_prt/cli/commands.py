@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +21,7 @@ from mi_sparse_prt.cli.tables import (
     matrix_tables,
     methods_tables,
     plan_tables,
+    plans_tables,
     relighting_table,
     scene_report,
     scene_tables,
@@ -451,6 +454,12 @@ def benchmark(
         bool,
         typer.Option("--time-error", help="Run every method instead, and compare time and error of all."),
     ] = False,
+    plans: Annotated[
+        bool,
+        typer.Option(
+            "--plans", help='Compare what method "auto" chooses with the other plans, carried out, instead.'
+        ),
+    ] = False,
     sizes: Annotated[
         bool,
         typer.Option(
@@ -477,19 +486,25 @@ def benchmark(
 
     With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
     With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
-    With --sizes --figures FOLDER: how cost grows.
+    With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
-    from mi_sparse_prt import benchmark
+    from mi_sparse_prt import benchmark as benchmarks
 
-    asked = {"--method": bool(method), "--choices": choices, "--time-error": time_error, "--sizes": sizes}
-    if sum(asked.values()) > 1:
-        raise typer.BadParameter(
-            "one at a time", param_hint=" / ".join(n for n, given in asked.items() if given)
-        )
-    if figures is not None and not any(asked.values()):
-        raise typer.BadParameter(f"there are figures of {', '.join(asked)} only", param_hint="--figures")
+    asked = {
+        "--method": bool(method),
+        "--choices": choices,
+        "--time-error": time_error,
+        "--plans": plans,
+        "--sizes": sizes,
+    }
+    which = [name for name, given in asked.items() if given]
+    if len(which) > 1:
+        raise typer.BadParameter("one at a time", param_hint=" / ".join(which))
+    if figures is not None and which in ([], ["--plans"]):
+        others = ", ".join(name for name in asked if name != "--plans")
+        raise typer.BadParameter(f"there are figures of {others} only", param_hint="--figures")
     if sizes and (edge_length is not None or resolution != DEFAULT_RESOLUTION):
         raise typer.BadParameter("it varies --edge-length and --resolution itself", param_hint="--sizes")
     with running(json_file, quiet) as command:
@@ -498,26 +513,22 @@ def benchmark(
         parameters, progress = _definitions(define), not quiet
         with command.prompt_interrupts():
             if sizes:
-                command.report = benchmark.cost_against_size(scene, parameters, progress, figures)
+                command.report = benchmarks.cost_against_size(scene, parameters, progress, figures)
                 tables = sizes_tables(command.report)
             else:
-                loaded, lighting = (
-                    prt.load_scene(scene, edge_length, **parameters),
-                    prt.CubemapLighting(resolution),
-                )
-                if method:
-                    names = [m.value for m in method]
-                    command.report = benchmark.measure_methods(loaded, lighting, names, progress, figures)
-                    tables = methods_tables(command.report)
-                elif choices:
-                    command.report = benchmark.measure_choices(loaded, lighting, progress, figures)
-                    tables = choices_tables(command.report)
-                elif time_error:
-                    command.report = benchmark.time_against_error(loaded, lighting, progress, figures)
-                    tables = time_error_tables(command.report)
-                else:
-                    command.report = benchmark.run_benchmark(loaded, lighting, repeats, progress)
-                    tables = benchmark_tables(command.report)
+                case = prt.load_scene(scene, edge_length, **parameters), prt.CubemapLighting(resolution)
+                names = [m.value for m in method or ()]
+                drawn = {} if figures is None else {"figures": figures}
+                kinds: dict[str, tuple[Callable[..., dict[str, Any]], Callable[..., list[Any]]]] = {
+                    "": (partial(benchmarks.run_benchmark, repeats=repeats), benchmark_tables),
+                    "--method": (partial(benchmarks.measure_methods, methods=names), methods_tables),
+                    "--choices": (benchmarks.measure_choices, choices_tables),
+                    "--time-error": (benchmarks.time_against_error, time_error_tables),
+                    "--plans": (benchmarks.measure_plans, plans_tables),
+                }
+                measure, show = kinds["".join(which)]
+                command.report = measure(*case, progress=progress, **drawn)
+                tables = show(command.report)
         if figures is not None:
             command.written.append(figures)
         command.show(*tables)

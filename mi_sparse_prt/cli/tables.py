@@ -256,6 +256,29 @@ def time_error_tables(report: dict[str, Any]) -> list[Table]:
     return [table, *([_sentences("Skipped", report["skipped"])] if report["skipped"] else [])]
 
 
+def plans_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_plans`` found: target errors, and all plans that were carried out, the quickest first."""
+    targets = _table("Auto", "target", "plan", "time", "error", "+-", "met", "choice / best", "all / best")
+    for found in report["targets"]:
+        ratios = ("-" if found[name] is None else f"{found[name]:.2f}" for name in ("choice", "whole"))
+        targets.add_row(
+            _share(found["target_error"]),
+            f"{_plan(found['plan'])} ({found['attempts']})",
+            _duration(found["seconds"]),
+            _share(found["estimated_error"]),
+            _share(found["standard_error"]),
+            "yes" if found["met"] else "no",
+            *ratios,
+        )
+    title = f"Plans carried out ({report['left_out']} slower ones were not)"
+    plans = _table(title, "", "time", "in all", "predicted", "error", "+-", "predicted")
+    for plan in report["plans"]:
+        seconds = (plan[name] for name in ("seconds", "seconds_in_all", "predicted_seconds"))
+        errors = (plan[name] for name in ("estimated_error", "standard_error", "predicted_error"))
+        plans.add_row(_plan(plan), *map(_duration, seconds), *map(_share, errors))
+    return [targets, plans]
+
+
 def sizes_tables(report: dict[str, Any]) -> list[Table]:
     """What ``cost_against_size`` found, for each series of sizes."""
     tables = []

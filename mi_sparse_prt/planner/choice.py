@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mi_sparse_prt.planner.direct_costs import DirectCost
@@ -15,8 +15,10 @@ from mi_sparse_prt.planner.sparse_costs import SparseCosts
 
 TARGET = 0.02  # where none is given
 MARGIN = 0.9  # of a target is aimed at: predictions are off at times
-DOUBT = 2.0  # by what factor they may be off ...
-TRIAL = 0.1  # ... for a plan to be tried that takes this share of the time of the quickest one that is good enough
+DOUBT = 2.0  # by what factor they may be off
+TRIAL = (
+    0.1  # a plan that this factor allows for is tried if it takes this share of the time of the one to choose
+)
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Costs:
         ``Plan.direct`` -> its cost.
     paths, gather, sparse : PathCosts, GatherCosts, SparseCosts or None
         None where there is no indirect light, or where it cannot be found so.
+    direct_share : float
+        Norm of direct light relative to that of the whole matrix.
     """
 
     fixed: float
@@ -38,6 +42,7 @@ class Costs:
     paths: PathCosts | None = None
     gather: GatherCosts | None = None
     sparse: SparseCosts | None = None
+    direct_share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,30 @@ def choose_first(plans: list[Predicted], target: float | None) -> Predicted:
 def _if_it_met(target: float, p: Predicted) -> float:
     """Seconds of a plan, had it as many more samples as the target takes."""
     return p.seconds * max(p.error / (MARGIN * target), 1.0) ** 2
+
+
+def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str | None:
+    """An approximation of direct light on whose error the choice depends: if it were twice as large, or half of it.
+
+    It costs little to find beside all rays, and then its error is known.
+    """
+    for name in costs.direct:
+        if name == "exact":
+            continue
+        choices = {
+            choose(
+                predictions(_with_error_times(factor, costs, name), target or TARGET, spp), target
+            ).plan.direct
+            for factor in (1 / DOUBT, DOUBT)
+        }
+        if name in choices and len(choices) > 1:
+            return name
+    return None
+
+
+def _with_error_times(factor: float, costs: Costs, name: str) -> Costs:
+    light = costs.direct[name]
+    return replace(costs, direct=costs.direct | {name: replace(light, error=factor * light.error)})
 
 
 def finer(

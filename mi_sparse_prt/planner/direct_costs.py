@@ -29,7 +29,7 @@ OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 @dataclass(frozen=True)
 class DirectCost:
-    """Seconds of all direct light, and its relative L2 error."""
+    """Seconds of all direct light, and its error relative to the whole matrix, L2."""
 
     seconds: float
     error: float
@@ -66,7 +66,7 @@ def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
     return Points(*(x[ids] for x in (points.positions, points.normals, points.offset_normals, points.keys)))
 
 
-def consensus_cost(scene: Scene, direct: DirectTransport, seed: int) -> DirectCost:
+def consensus_cost(scene: Scene, direct: DirectTransport, held: PilotElements, seed: int) -> DirectCost:
     """Consensus in the direction basis, from patches inside of which all rays are traced as well."""
     patches, inner, stands_for = _patches(scene, seed)
     ids = np.concatenate(patches)
@@ -86,7 +86,7 @@ def consensus_cost(scene: Scene, direct: DirectTransport, seed: int) -> DirectCo
     power = (scene.albedo[ids] ** 2).sum(axis=1) * stands_for
     exact = direct.rows(ids.astype(np.uint32)).astype(np.uint32, copy=False)
     wrong, all_of_it = (float(power @ _energy(direct, ids, bits)) for bits in (exact ^ seen, exact))
-    return DirectCost(seconds, math.sqrt(wrong / max(all_of_it, 1e-300)))
+    return DirectCost(seconds, held.share(held.direct) * math.sqrt(wrong / max(all_of_it, 1e-300)))
 
 
 def _patches(

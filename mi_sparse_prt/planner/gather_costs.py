@@ -74,10 +74,14 @@ class GatherCosts:
     spectrum: NDArray[np.float64]
 
     def error(self, rays: int, tolerance: float) -> float:
-        """Predicted relative L2 error of the whole matrix."""
+        """Predicted relative L2 error of the whole matrix.
+
+        Of the first bounce's errors only the bias is carried on into the next ones: noise, and what a low rank leaves
+        out, differ from vertex to vertex and are averaged by gathering.
+        """
         fall = math.log(max(self.noise[FEW], 1e-12) / max(self.noise[MANY], 1e-12)) / math.log(MANY / FEW)
         noise = self.noise[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
-        return self.growth * math.sqrt(noise**2 + self.bias**2 + (tolerance * self.first) ** 2)
+        return math.sqrt(noise**2 + (self.growth * self.bias) ** 2 + (tolerance * self.first) ** 2)
 
     def rank(self, tolerance: float) -> float:
         """Predicted rank of the first bounce.
@@ -127,7 +131,7 @@ def gather_costs(
     light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]
     noise = [held.relative_square(held.weighted((a - b) ** 2 / 2)) for a, b in light]
     first = held.indirect if max_depth == 3 else held.paths(3)
-    sizes = [held.relative_square(held.weighted(h.values[0] * h.values[1])) for h in (first, held.indirect)]
+    sizes = [held.share(light) for light in (first, held.indirect)]
     bias = held.relative_square(
         held.weighted((light[1][0] - first.values[0]) * (light[1][1] - first.values[1]))
     )
@@ -145,8 +149,8 @@ def gather_costs(
         len(many[0].data) / (MANY * len(held.vertices)),
         dict(zip((FEW, MANY), np.sqrt(noise).tolist(), strict=True)),
         math.sqrt(max(bias, 0.0)),
-        math.sqrt(max(sizes[0], 0.0)),
-        math.sqrt(max(sizes[1] / max(sizes[0], 1e-300), 1.0)),
+        sizes[0],
+        max(sizes[1] / max(sizes[0], 1e-150), 1.0),
         pilot.spectrum(few[0], held.stand_for, seed),
     )
 

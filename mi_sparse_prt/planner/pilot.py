@@ -55,10 +55,11 @@ def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect:
     auto, exact = settings.method == "auto", exact_cost(direct, held)
     light = {"exact": exact}
     if auto and settings.basis == "direction":
-        light["consensus"] = consensus_cost(scene, direct, seed)
+        light["consensus"] = consensus_cost(scene, direct, held, seed)
     elif auto:
         light["edges"] = edges_cost(scene, direct, held)
-    costs = Costs(_check(held) * (1 if settings.target_error is None else 2), light)
+    checks = 1 if settings.target_error is None else 2
+    costs = Costs(checks * _check(held), light, direct_share=held.share(held.direct))
     if not indirect:
         return costs
     path = seconds_of_a_path(scene, settings, lighting)

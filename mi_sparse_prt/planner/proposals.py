@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from mi_sparse_prt.planner.choice import TARGET, Costs, choose, choose_first, finer, predictions
+from mi_sparse_prt.planner.choice import (
+    TARGET,
+    Costs,
+    Predicted,
+    choose,
+    choose_first,
+    finer,
+    predictions,
+    uncertain,
+)
+from mi_sparse_prt.planner.direct_costs import DirectCost
 from mi_sparse_prt.planner.plan import EFFORTS, Plan
 from mi_sparse_prt.settings import Settings
 
 ATTEMPTS = 4
+PATIENCE = 20.0  # times what all attempts were to take: what is to take longer is left to the user
 
 
 class Ladder:
@@ -25,9 +37,12 @@ class Ladder:
         The present one.
     seconds : float or None
         What it is predicted to take in all.
+    too_long : None
+        See ``Ranking``.
     """
 
     seconds: float | None = None
+    too_long: Predicted | None = None
 
     def __init__(self, plans: Sequence[Plan]) -> None:
         self.plan, *self._others = plans
@@ -45,21 +60,33 @@ class Ladder:
 
 
 class Ranking:
-    """Plans by what was measured; attributes and methods are those of ``Ladder``.
+    """Plans by what was measured; attributes and methods of the same name are those of ``Ladder``.
 
     Parameters
     ----------
     costs : Costs
     settings : Settings
+
+    Attributes
+    ----------
+    too_long : Predicted or None
+        A plan that would meet the target after all, and would take very long.
     """
 
+    too_long: Predicted | None = None
+
     def __init__(self, costs: Costs, settings: Settings) -> None:
-        self._costs, self._settings = costs, settings
+        self._settings = settings
+        self._rank(costs)
+
+    def _rank(self, costs: Costs) -> None:
+        settings = self._settings
+        self._costs = costs
         self._plans = predictions(costs, settings.target_error or TARGET, settings.spp)
         # errors of paths are predicted too well for a trial to turn out better
         begin = choose_first if settings.method == "auto" else choose
         self._best = begin(self._plans, settings.target_error)
-        self._tried = [self._best.plan]
+        self._tried = [self._best]
 
     @property
     def plan(self) -> Plan:
@@ -71,23 +98,39 @@ class Ranking:
         """What it is predicted to take in all."""
         return self._best.seconds
 
+    @property
+    def uncertain(self) -> str | None:
+        """Direct light to find and to judge before anything else, as the choice depends on it."""
+        return uncertain(self._costs, self._settings.target_error, self._settings.spp)
+
+    def judged(self, direct: str, error: float) -> None:
+        """Choose again, now that this direct light has been found and its error, relative to all of it, is known."""
+        costs = self._costs
+        found = DirectCost(0.0, costs.direct_share * error)
+        fixed = costs.fixed + costs.direct[direct].seconds
+        self._rank(replace(costs, fixed=fixed, direct=costs.direct | {direct: found}))
+
     def after(self, error: float) -> bool:
-        """Go on to a finer plan, the present one having this error; False if there is none."""
+        """Go on to a finer plan, the present one having this error; False if none meets the target in sensible time."""
         target = self._settings.target_error
         if target is None or len(self._tried) == ATTEMPTS:
             return False
         found = finer(self._costs, self._best, error, target, self._settings.spp)
         if found is None:
             return False
+        if found.seconds > PATIENCE * sum(p.seconds for p in self._tried):
+            self.too_long = found
+            return False
         self._best = found
         self._plans.append(found)
-        self._tried.append(found.plan)
+        self._tried.append(found)
         return True
 
     def report(self) -> list[dict[str, Any]]:
         """Plans that were compared, the quickest first; those that were carried out are the chosen ones."""
         unique = {p.plan: p for p in self._plans}.values()
-        return [p.report(p.plan in self._tried) for p in sorted(unique, key=lambda p: p.seconds)]
+        tried = [p.plan for p in self._tried]
+        return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
 
 
 def ladder(settings: Settings) -> Ladder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -128,6 +129,10 @@ class PilotElements:
     def relative_square(self, values: Values) -> float:
         """Sum over the whole matrix of a quantity known at the held-out elements, (k, t), over its squared norm."""
         return self._total(values) / max(self._norm, 1e-300)
+
+    def share(self, part: Halves) -> float:
+        """Norm of a part relative to that of the whole matrix."""
+        return math.sqrt(max(self.relative_square(self._squares(*part.values)), 0.0))
 
     def squared_error(self, elements: Values) -> NDArray[np.float64]:
         """Unbiased squared errors (k, t) of single elements (k, t, 3), summed over channels."""

@@ -21,6 +21,7 @@ from mi_sparse_prt.planner.plan import GATHER, Plan
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 LIGHTING = prt.CubemapLighting(4)
 EXACT = {"exact": DirectCost(10.0, 0.0)}
@@ -180,7 +181,10 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
     assert all(mesh.vertices.stop - mesh.vertices.start <= PATCH for mesh in grey_scene.meshes)
     lighting = prt.CubemapLighting(8)
     direct = DirectTransport(grey_scene.normalised, lighting, vertex_points(grey_scene))
-    predicted = consensus_cost(grey_scene, direct, 0).error
+    held = PilotElements(grey_scene, lighting, "direction", 2, False, 0)
+    predicted = consensus_cost(grey_scene, direct, held, 0).error
+    held = PilotElements(grey_scene, lighting, "direction", 5, True, 0)
+    of_whole = consensus_cost(grey_scene, direct, held, 0).error
     exact, ours = (
         prt.precompute(grey_scene, lighting, Plan(how, "none"), progress=False).rows(
             range(grey_scene.n_vertices)
@@ -190,6 +194,10 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
     true = np.linalg.norm(ours - exact) / np.linalg.norm(exact)
     assert true > 0.005
     assert predicted == pytest.approx(true, rel=1e-3)
+    whole = prt.precompute(grey_scene, lighting, "brute_force", spp=64, progress=False)
+    share = np.linalg.norm(exact) / np.linalg.norm(whole.rows(range(grey_scene.n_vertices)))
+    assert share < 0.96
+    assert of_whole == pytest.approx(share * true, rel=0.02)
 
 
 def test_predicted_errors_are_those_of_the_matrix():
