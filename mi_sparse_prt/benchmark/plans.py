@@ -50,7 +50,9 @@ def measure_plans(
         - ``left_out``: how many plans were predicted to take over 1.5 times as long as those chosen.
     """
     made = [_auto(scene, lighting, target, progress) for target in targets]
-    found = {_plan(p): (p, auto) for auto in made for p in auto["plans"]}
+    every = [(p, auto) for auto in made for p in auto["plans"]]
+    # predictions differ from run to run: those count that a plan was chosen by
+    found = {_plan(p): (p, auto) for p, auto in sorted(every, key=lambda pair: pair[0]["chosen"])}
     longest = SLOWER * max(p["predicted_seconds"] for p, _ in found.values() if p["chosen"])
     plans = [
         _carried_out(scene, lighting, plan, p, auto, progress)
