@@ -28,6 +28,7 @@ LEAST_VERTICES = 16  # of each
 TEXELS = 16
 SEEDS = 1 << 20  # apart from those of the matrix
 LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samples per element
+FEW_JUDGES = 0.25  # of the held-out elements: these mostly tell whether a target is met
 CHECK = 0.3  # seconds of a check by held-out elements, beside its paths
 
 
@@ -58,7 +59,7 @@ def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect:
         light["consensus"] = consensus_cost(scene, direct, held, seed)
     elif auto:
         light["edges"] = edges_cost(scene, direct, held)
-    checks = 1 if settings.target_error is None else 2
+    checks = 1 if settings.target_error is None else 1 + FEW_JUDGES
     costs = Costs(checks * _check(held), light, direct_share=held.share(held.direct))
     if not indirect:
         return costs

@@ -55,7 +55,11 @@ class Chosen:
 
 
 def for_direct_light(
-    transport: LightTransport, normals: NDArray[np.float32], inside: slice, rng: np.random.Generator
+    transport: LightTransport,
+    normals: NDArray[np.float32],
+    inside: slice,
+    rng: np.random.Generator,
+    effort: float = 1.0,
 ) -> Chosen:
     """Draw elements for direct light, at all vertices of a mesh: a few of them may hold most of the error.
 
@@ -70,10 +74,12 @@ def for_direct_light(
     inside : slice
         The vertices of the mesh.
     rng : numpy.random.Generator
+    effort : float
+        Of the usual number of elements.
     """
     lighting, part = transport.lighting, transport.direct
     total = (inside.stop - inside.start) * lighting.n_directions
-    rays = max(RAYS * total, min(total / 4, FEWEST_RAYS))
+    rays = effort * max(RAYS * total, min(total / 4, FEWEST_RAYS))
     floor = 0.0
     if not isinstance(part, Visibility):
         rays, floor = rays / FEW, BELOW_HORIZON
@@ -91,7 +97,9 @@ def for_direct_light(
     return Chosen(found.vertices[kept], found.texels[kept], weights[kept])
 
 
-def for_indirect_light(transport: LightTransport, inside: slice, rng: np.random.Generator) -> Chosen:
+def for_indirect_light(
+    transport: LightTransport, inside: slice, rng: np.random.Generator, effort: float = 1.0
+) -> Chosen:
     """Draw elements for indirect light, where the matrix has most of it: there its errors and the paths' noise are.
 
     Parameters
@@ -101,11 +109,13 @@ def for_indirect_light(transport: LightTransport, inside: slice, rng: np.random.
     inside : slice
         The vertices of the mesh.
     rng : numpy.random.Generator
+    effort : float
+        Of the usual number of elements.
     """
     assert transport.indirect is not None
     total = (inside.stop - inside.start) * transport.lighting.n_directions
     share = max(PATHS // len(transport.meshes), FEW_PATHS)
-    count = max(min(share, total // 16), min(FEWEST_PATHS, total))
+    count = max(round(effort * min(share, total // 16)), min(FEWEST_PATHS, total))
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start

@@ -48,7 +48,9 @@ class Sample:
     norms: NDArray[np.float64]
 
 
-def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> dict[str, Any]:
+def held_out_error(
+    scene: Scene, transport: LightTransport, max_depth: int, seed: int, effort: float = 1.0
+) -> dict[str, Any]:
     """Estimate the relative L2 error of a matrix.
 
     Parameters
@@ -60,6 +62,8 @@ def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed
         As for ``precompute``. Where the matrix has no indirect light, none is expected.
     seed : int
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
+    effort : float
+        Of the usual number of elements, at most 1; the standard error grows as its inverse root.
 
     Returns
     -------
@@ -72,11 +76,11 @@ def held_out_error(scene: Scene, transport: LightTransport, max_depth: int, seed
     samples: dict[str, list[Sample]] = {}
     count = 0
     for mesh in transport.meshes:
-        lit = for_direct_light(transport, scene.normals, mesh.vertices, rng)
+        lit = for_direct_light(transport, scene.normals, mesh.vertices, rng, effort)
         samples[mesh.name] = [judge.direct(lit)]
         seen = [lit]
         if transport.indirect is not None:
-            seen.append(for_indirect_light(transport, mesh.vertices, rng))
+            seen.append(for_indirect_light(transport, mesh.vertices, rng, effort))
             samples[mesh.name].append(judge.indirect(seen[1]))
         count += _distinct(seen, transport.lighting.n_directions)
     meshes = {name: relative(found) for name, found in samples.items()}

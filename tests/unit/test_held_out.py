@@ -202,6 +202,32 @@ def test_rare_wrong_bits(exact, monkeypatch, where):
     assert 0.67 < np.sqrt((errors**2).mean()) / found.std() < 1.5
 
 
+def test_less_effort(exact, monkeypatch):
+    """
+    Expected: a quarter of the elements; estimates without bias (3 standard errors, that would show 2% of it), twice as
+    far from the truth on average, and reported so.
+    """
+    monkeypatch.setattr(chosen, "FEWEST_RAYS", 16_000)
+    scene, transport = exact
+    truth = [transport.rows(np.arange(scene.n_vertices)).astype(np.float64)] * 2
+    wrong = flipped(transport, 4000, seed=1)
+    true = errors_of(scene, wrong, truth)["total"]
+    usual, less = (
+        [held_out_error(scene, wrong, 2, seed, effort) for seed in range(count)]
+        for effort, count in ((1.0, 40), (0.25, 160))
+    )
+    assert 0.2 < np.mean([r["elements"] for r in less]) / np.mean([r["elements"] for r in usual]) < 0.3
+    squares, all_squares = (np.array([r["total"] for r in reports]) ** 2 for reports in (less, usual))
+    spread = squares.std(ddof=1) / np.sqrt(len(squares))
+    assert abs(squares.mean() - true**2) < 3 * spread
+    assert spread < 0.02 * true**2
+    assert 1.5 < squares.std() / all_squares.std() < 2.7
+    reported = [
+        np.mean([r["standard_error"]["total"] ** 2 for r in reports]) ** 0.5 for reports in (less, usual)
+    ]
+    assert 1.5 < reported[0] / reported[1] < 2.7
+
+
 @pytest.mark.parametrize(
     ("method", "basis"),
     [
