@@ -49,6 +49,11 @@ def pack(mask: NDArray[np.bool_]) -> Bits:
     return np.packbits(padded, axis=-1, bitorder="little").view(np.uint32)
 
 
+def bits_at(bits: Bits, rows: NDArray[np.integer], directions: NDArray[np.integer]) -> NDArray[np.uint32]:
+    """One bit each, 0 or 1, (m,): direction of row."""
+    return (bits[rows, directions // BITS] >> (directions % BITS).astype(np.uint32)) & 1
+
+
 def unpack(bits: Bits, n: int) -> NDArray[np.bool_]:
     """Mask (..., n) of bits (..., ceil(n / 32))."""
     flat = np.unpackbits(np.ascontiguousarray(bits).view(np.uint8), axis=-1, bitorder="little")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.reconstruction.nodes import NODES
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.contacts import contacts
 from mi_sparse_prt.transport.direct import DirectTransport
 from mi_sparse_prt.transport.first_bounce import FEW_ROWS, MIXED, ROWS
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
@@ -179,6 +180,7 @@ class _Pilot:
     def __init__(self, scene: Scene, direct: DirectTransport, vertices: NDArray[np.integer]) -> None:
         self._scene, self._direct, self._vertices = scene, direct, vertices
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3]
+        self._contacts = contacts(scene, direct.lighting)
 
     def rays(self, count: int, seed: int) -> scipy.sparse.csr_array:
         """Rows of G."""
@@ -188,9 +190,9 @@ class _Pilot:
         """The first bounce (k, t, channels) of white transport at t texels (k, t) of each vertex."""
         row = np.repeat(np.arange(len(texels)), np.diff(rays.indptr))
         asked = texels[row]  # [entry, texel]
-        seen = self._direct.elements(np.repeat(rays.indices, asked.shape[1]), asked.ravel()).reshape(
-            asked.shape
-        )
+        vertices = np.repeat(rays.indices, asked.shape[1])
+        seen = self._direct.elements(vertices, asked.ravel()) * self._contacts.counts(vertices, asked.ravel())
+        seen = seen.reshape(asked.shape)
         mean = scipy.sparse.csr_array(
             (rays.data, np.arange(len(row)), rays.indptr), shape=(len(texels), len(row))
         )

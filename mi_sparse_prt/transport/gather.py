@@ -25,6 +25,7 @@ from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import Factored, Part
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.contacts import contacts
 from mi_sparse_prt.transport.direct_columns import DirectColumns
 from mi_sparse_prt.transport.first_bounce import LowRank, all_but_least, first_bounce
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
@@ -76,6 +77,8 @@ class GatherTransport:
     Attributes
     ----------
     nodes : Nodes
+    contacts : Contacts
+        Vertices whose light is in part none for the triangles around them.
     matrix : (n_nodes, n_v) sparse float32
         G. Rows sum to the share of the hemisphere, by cosine, in which fronts of surfaces are seen.
     channels : {1, 3}
@@ -107,6 +110,7 @@ class GatherTransport:
         self._keys = points.keys
         self.nodes = nodes or Nodes(np.arange(len(points)), None)
         self.rays = len(self.nodes) * rays_per_vertex
+        self.contacts = contacts(scene, lighting)
         self.matrix = gather_matrix(scene, points, rays_per_vertex, seed, self.nodes.ids)
 
     def apply(self, columns: Floats) -> Floats:
@@ -115,7 +119,7 @@ class GatherTransport:
         Parameters
         ----------
         columns : (n_v, k) float32
-            White direct transport of each light.
+            White direct transport of each light, without what ``contacts`` leaves out.
 
         Returns
         -------
@@ -148,6 +152,7 @@ class GatherTransport:
         (k, n_directions, channels) float32
             White indirect transport.
         """
+        direct = self.contacts.lit(direct)
         count = self._count_for(direct)
         totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
         result = np.empty((len(ids), self.lighting.n_directions, self.channels), np.float32)
@@ -184,6 +189,7 @@ class GatherTransport:
         -------
         Gathered
         """
+        direct = self.contacts.lit(direct)
         count = self._count_for(direct)
         if count == 0:
             left = np.zeros((self._albedo.shape[1], 0), np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import BITS
+from mi_sparse_prt.bits import bits_at
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.transport.direct import FIXED_POINT
@@ -49,8 +49,7 @@ def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
 
 
 def _seen(part: Visibility, ids: Ids, texels: Ids) -> NDArray[np.float32]:
-    words = part.bits[ids, texels // BITS]
-    seen = (words >> (texels % BITS).astype(np.uint32)) & 1
+    seen = bits_at(part.bits, ids, texels)
     cosine = np.einsum("md,md->m", part.normals[ids], part.lighting.directions[texels])
     weights = part.lighting.solid_angles[texels] / np.float32(np.pi)
     return (np.maximum(cosine, 0) * seen * weights).astype(np.float32)[:, None]

@@ -138,12 +138,13 @@ def test_same_seed_same_matrix_whatever_the_order(coloured_scene):
 
 
 def test_blocks_change_nothing_and_share_a_kernel(grey_scene, monkeypatch):
-    known = solver(grey_scene).matrix
+    arguments = grey_scene, vertex_points(grey_scene), 64
+    known = gather_matrix(*arguments)
     monkeypatch.setattr(matrix_module, "LANES", 64 * 50)
-    solver(grey_scene)
+    gather_matrix(*arguments)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        some = solver(grey_scene).matrix
+        some = gather_matrix(*arguments)
         kernels = [k for k in dr.kernel_history((dr.KernelType.JIT,)) if k["size"] >= 64]
     assert len(known.indptr) > 5 * 50
     assert not any(k["cache_miss"] for k in kernels if "cache_miss" in k)
@@ -266,8 +267,8 @@ def test_low_rank_and_rows_against_the_series(coloured_scene, kind, monkeypatch)
     """
     monkeypatch.setattr(columns_module, "BLOCK", 250 * 30)
     direct = direct_parts(coloured_scene)[kind]
-    white = direct.columns(np.arange(96))[..., 0]
     gather = solver(coloured_scene, 4)
+    white = gather.contacts.lit(direct).columns(np.arange(96))[..., 0]
     known = neumann(gather, white, coloured_scene.albedo, 3)
     some = np.array([7, 200, 7, 250])
     assert relative(gather.rows(direct, some), known[some]) < 1e-5
@@ -306,7 +307,7 @@ def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
     monkeypatch.setattr(bounce_module, "MIXED", 4)
     gather, direct = solver(coloured_scene, 8, max_depth=3), visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.1)
-    known = gather.apply(direct.columns(np.arange(384))[..., 0])
+    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
     missing = relative(found.columns(np.arange(384)), known)
     assert max(found.ranks) < 70
     assert missing == pytest.approx(found.left_out, rel=0.25)
@@ -314,9 +315,16 @@ def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
 
 @dataclass(frozen=True)
 class SomePart:
-    """A direct part of which only columns are known."""
+    """A direct part that is none of those known by type."""
 
     part: Visibility
+
+    @property
+    def nbytes(self) -> int:
+        return self.part.nbytes
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        return self.part.rows(ids)
 
     def columns(self, ids: np.ndarray) -> np.ndarray:
         return self.part.columns(ids)
@@ -344,7 +352,7 @@ def test_least_squares_from_some_rows(monkeypatch):
     monkeypatch.setattr(bounce_module, "FEW_ROWS", 16)
     monkeypatch.setattr(bounce_module, "SUMS", 512)
     found = gather.indirect(direct, tolerance=0.1)
-    known = gather.apply(direct.columns(np.arange(96))[..., 0])
+    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(96))[..., 0])
     assert scene.n_vertices > 1500
     assert bounce_module.ROWS * sum(found.ranks) < scene.n_vertices / 2
     assert relative(found.columns(np.arange(96)), known) == pytest.approx(found.left_out, rel=0.33)

@@ -107,7 +107,7 @@ def test_without_a_target_nobody_waits_for_hours():
     assert choose_first(plans, None) == choose(plans, None)
     hours = choose(plans, 0.02)
     assert finer(costs, trial, trial.error, 0.02) == hours
-    assert (hours.plan.indirect, hours.error) == ("paths", pytest.approx(0.018, rel=0.01))
+    assert (hours.plan.indirect, hours.error) == ("paths", pytest.approx(MARGIN * 0.02, rel=0.01))
     assert hours.seconds > 7 * 3600
     usual = choose(plans, None)
     assert usual.plan.indirect == "sparse"
@@ -138,14 +138,9 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
     Expected: an error of 1.2% is looked at for a target of 2%, but not where 2.4% would do or 0.6% would not; what is
         found, relative to the whole matrix, decides, and its time is spent in either case.
     """
-    assert [uncertain(Costs(0, BOTH), target) for target in (0.003, 0.02, None, 0.05)] == [
-        None,
-        "consensus",
-        "consensus",
-        None,
-    ]
+    assert [uncertain(Costs(0, BOTH), target) for target in (0.003, 0.02, 0.05)] == [None, "consensus", None]
     assert uncertain(Costs(0, EXACT), 0.02) is None
-    for error, seconds, plan in ((0.019, 1 + 4.0, "consensus"), (0.021, 1 + 14.0, "exact")):
+    for error, seconds, plan in ((0.019, 1 + 4.0, "consensus"), (0.022, 1 + 14.0, "exact")):
         ranking = Ranking(Costs(1, BOTH, direct_share=0.9), Settings(4, target_error=0.02))
         assert ranking.uncertain == "consensus"
         ranking.judged("consensus", error)
