@@ -24,6 +24,7 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.errors import PrtError, PrtWarning
 
 FAILED, INTERRUPTED = 1, 130  # exit codes
+FILE_WIDTH = 150  # characters of a table's line where there is no terminal
 GRACE = 1.0  # seconds that Ctrl-C gives a kernel to end by itself
 
 
@@ -34,7 +35,9 @@ class Command:
         self.report: dict[str, Any] = {}
         self.written: list[Path] = []
         self.hint = ""  # what to do after an interruption
-        self._console = Console(quiet=quiet, markup=False, emoji=False, highlight=False)
+        wide = not sys.stdout.isatty() and "COLUMNS" not in os.environ  # a file or a pipe: rich would take 80
+        width = FILE_WIDTH if wide else None
+        self._console = Console(quiet=quiet, markup=False, emoji=False, highlight=False, width=width)
 
     def show(self, *tables: Table) -> None:
         for table in tables:

@@ -106,12 +106,13 @@ def choose_first(plans: list[Predicted], target: float | None) -> Predicted:
     """The plan to begin with, which held-out elements will judge.
 
     It is that of ``choose``; but where one that nearly meets the target takes next to no time beside it, that one: it
-    may turn out to be good enough.
+    may turn out to be good enough. The less time, the farther off it may seem.
     """
     best = choose(plans, target)
     if target is None:
         return best
-    trials = [p for p in plans if p.error <= DOUBT * target and p.seconds <= TRIAL * best.seconds]
+    spare = [(p, TRIAL * best.seconds / p.seconds) for p in plans]
+    trials = [p for p, factor in spare if factor >= 1 and p.error <= DOUBT * target * math.sqrt(factor)]
     return min(trials, key=lambda p: _if_it_met(target, p)) if trials else best
 
 

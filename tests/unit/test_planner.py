@@ -99,7 +99,7 @@ def test_without_a_target_nobody_waits_for_hours():
 
     With a target, "sparse" is tried, minutes beside hours; and if that missed, hours it is.
     """
-    sparse = SparseCosts(vertices=1000, rays=10.0, path=100.0, noise=0.6, spp=16)
+    sparse = SparseCosts(vertices=1000, rays=10.0, path=100.0, noise=0.2, spp=16)
     costs = Costs(0, EXACT, PathCosts({32: 100.0}, {32: 0.3}, {32: 0.0}), None, sparse)
     plans = predictions(costs, 0.02)
     trial = choose_first(plans, 0.02)
