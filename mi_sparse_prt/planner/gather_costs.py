@@ -159,7 +159,7 @@ def _typical(held: PilotElements, squares: NDArray[np.float64]) -> float:
     """Median, over groups of vertices, of what squares (k, t, channels) of white transport are relative to the matrix.
 
     Interpolation errs much at few places. Where one of these is among the vertices, the mean says that no number of
-    rays is enough, and a plan of hours follows; a plan of seconds that then turns out to be not good enough costs seconds.
+    rays is enough, and a plan of hours follows. A plan that turns out to be not good enough costs seconds.
     """
     group = np.arange(len(squares)) % GROUPS
     shares = [np.where((group == g)[:, None], held.weighted(squares), 0.0) for g in range(GROUPS)]

@@ -15,7 +15,6 @@ DIRECT = 0.01  # relative L2 error for direct light
 # error of indirect light, relative to the noise of as many paths for all elements: 0.3 on meshes of 15,000 vertices and
 # more, whose rows hide noise from each other, 0.8 on those of hundreds. A trial may turn out better, hardly worse
 NOISE = 0.8
-FALL = 0.3  # power of the share of dense vertices with which the error falls: from 5.8 to 3.9% on the terrace
 
 
 @dataclass(frozen=True)
@@ -47,4 +46,4 @@ class SparseCosts:
 
     def error(self, dense: float) -> float:
         """Predicted relative L2 error of the whole matrix."""
-        return math.hypot(DIRECT, NOISE * self.noise / math.sqrt(self.spp)) * (DENSE / dense) ** FALL
+        return math.hypot(DIRECT, NOISE * self.noise / math.sqrt(self.spp)) * math.sqrt(DENSE / dense)
