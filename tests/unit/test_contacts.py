@@ -14,7 +14,7 @@ from mi_sparse_prt.transport.gather_matrix import gather_matrix
 from mi_sparse_prt.transport.path import PathTransport
 from mi_sparse_prt.validation.elements import elements
 
-LIGHTING = prt.CubemapLighting(8)
+LIGHTING = prt.CubemapLighting(4)
 WHITE = diffuse(0.8, 0.8, 0.8)
 
 
@@ -101,7 +101,7 @@ def test_errors_at_a_contact_shrink():
     scene, lighting = build(0.1, ground=GROUND, ball=BALL), LIGHTING
     points, near = vertex_points(scene), np.linalg.norm(scene.positions, axis=1)
     ids = np.setdiff1d(np.nonzero(near < 0.35)[0], contacts(scene, lighting).vertices)
-    paths = PathTransport(scene.normalised, lighting, points, "direction", 3, 4096, 1)
+    paths = PathTransport(scene.normalised, lighting, points, "direction", 3, 1024, 1)
     every = np.repeat(ids, lighting.n_directions), np.tile(np.arange(lighting.n_directions), len(ids))
     shape = len(ids), lighting.n_directions
     true = paths.elements(*every, 0).mean.reshape(shape) * lighting.solid_angles
