@@ -219,4 +219,5 @@ class _Pilot:
         texels = np.random.default_rng(seed).choice(n, min(n, TEXELS), replace=False)
         light = self.light(rays, np.tile(texels, (len(stand_for), 1)))[:, :, 0] * np.sqrt(stand_for)[:, None]
         squares = np.linalg.svd(light, compute_uv=False) ** 2
-        return 1 - np.cumsum(squares) / squares.sum()
+        total = float(squares.sum())
+        return 1 - np.cumsum(squares) / total if total > 0 else np.zeros(len(squares))

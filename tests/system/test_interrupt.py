@@ -21,6 +21,8 @@ SCENE = """<scene version="3.0.0">
 </scene>
 """
 WORK = [
+    "--method",
+    "brute_force",
     "--resolution",
     "16",
     "--indirect-resolution",

@@ -214,17 +214,15 @@ def test_less_effort(exact, monkeypatch):
     true = errors_of(scene, wrong, truth)["total"]
     usual, less = (
         [held_out_error(scene, wrong, 2, seed, effort) for seed in range(count)]
-        for effort, count in ((1.0, 30), (0.25, 100))
+        for effort, count in ((1.0, 40), (0.25, 160))
     )
     assert 0.2 < np.mean([r["elements"] for r in less]) / np.mean([r["elements"] for r in usual]) < 0.35
     squares, all_squares = (np.array([r["total"] for r in reports]) ** 2 for reports in (less, usual))
     spread = squares.std(ddof=1) / np.sqrt(len(squares))
     assert abs(squares.mean() - true**2) < 3 * spread
-    assert spread < 0.03 * true**2
+    assert spread < 0.04 * true**2
     assert 1.5 < squares.std() / all_squares.std() < 2.7
-    reported = [
-        np.mean([r["standard_error"]["total"] ** 2 for r in reports]) ** 0.5 for reports in (less, usual)
-    ]
+    reported = [np.median([r["standard_error"]["total"] for r in reports]) for reports in (less, usual)]
     assert 1.5 < reported[0] / reported[1] < 2.7
 
 

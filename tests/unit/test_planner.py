@@ -4,9 +4,10 @@ import json
 import math
 import warnings
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import GREY, build, still_life
+from conftest import GREY, build, diffuse, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.cost import Stopwatch
@@ -277,6 +278,19 @@ def test_costs_of_what_is_left_open(grey_scene, indirect):
     assert (costs.gather is not None) == (costs.paths is not None) == indirect
     if costs.paths:
         assert costs.paths.seconds.keys() == {2}
+
+
+@pytest.mark.filterwarnings("error", "ignore:.*faces point inwards")
+def test_a_room_without_light():
+    """Nothing to gather in a closed room: no rank, no error, and no division by it."""
+    room = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*GREY[0])}
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": diffuse(*GREY[0])}
+    scene = build(0.5, room=room, box=box)
+    direct = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    costs = measure(scene, direct, Settings(4, max_depth=4), indirect=True)
+    assert costs.gather is not None
+    assert costs.gather.rank(0.03) == costs.gather.error(64, 0.06) == 0
+    assert costs.direct["consensus"].error == 0
 
 
 def test_other_materials_are_not_gathered_from():

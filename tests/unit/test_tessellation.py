@@ -198,7 +198,9 @@ def test_subdivision_of_any_tetrahedron_is_conforming(corners: list, share: floa
     assert longest_edge(fine) <= length * (1 + ts.TIE)
     assert set(welded_edge_counts(fine)) == {2}
     assert area(fine) == pytest.approx(area(mesh), rel=1e-5)
-    assert volume(fine) == pytest.approx(volume(mesh), rel=1e-4)
+    # new vertices are rounded to float32, which moves a flat tetrahedron's faces by a share of its size
+    rounding = 1e-7 * area(mesh) * longest_edge(mesh)
+    assert volume(fine) == pytest.approx(volume(mesh), rel=1e-4, abs=rounding)
 
 
 # ---------------------------------------------------------------------------------------------- clean
