@@ -16,9 +16,7 @@ from mi_sparse_prt.planner.sparse_costs import SparseCosts
 TARGET = 0.02  # where none is given
 MARGIN = 0.95  # of a target is aimed at: predictions are off at times
 DOUBT = 2.0  # by what factor they may be off
-TRIAL = (
-    0.1  # a plan that this factor allows for is tried if it takes this share of the time of the one to choose
-)
+TRIAL = 0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first
 
 
 @dataclass(frozen=True)

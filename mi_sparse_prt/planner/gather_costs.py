@@ -163,9 +163,9 @@ def _typical(held: PilotElements, squares: NDArray[np.float64]) -> float:
     Interpolation errs much at few places. Where one of these is among the vertices, the mean says that no number of
     rays is enough, and a plan of hours follows. A plan that turns out to be not good enough costs seconds.
     """
-    group = np.arange(len(squares)) % GROUPS
-    shares = [np.where((group == g)[:, None], held.weighted(squares), 0.0) for g in range(GROUPS)]
-    return GROUPS * float(np.median([held.relative_square(share) for share in shares]))
+    group, weighted = np.arange(len(squares))[:, None] % GROUPS, held.weighted(squares)
+    shares = [held.relative_square(np.where(group == g, weighted, 0.0)) for g in range(GROUPS)]
+    return GROUPS * float(np.median(shares))
 
 
 def _seconds_of_products(direct: DirectTransport, rays: scipy.sparse.csr_array) -> tuple[float, float]:

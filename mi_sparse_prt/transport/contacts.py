@@ -20,9 +20,7 @@ from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import MeanCosine, Part, Visibility
 from mi_sparse_prt.scene import Scene
 
-BEYOND = (
-    0.02  # of the way from a triangle's middle to its corner: what is as near behind the corner touches it
-)
+BEYOND = 0.02  # of the way from a triangle's middle to a corner: what is as near behind it touches it
 SMOOTH = 0.5  # cosine between the normals of two triangles, above which they are taken for one surface
 DIGITS = 3  # of normals: what is equal in these is one plane
 
@@ -60,8 +58,16 @@ class Contacts:
         bits[self.vertices] &= self.open
         if isinstance(direct, Visibility):
             return replace(direct, bits=bits)
-        vertices = np.repeat(np.arange(len(bits)), np.diff(direct.starts))
-        return replace(direct, bits=bits, shares=direct.shares * self.counts(vertices, direct.texels))
+        return replace(direct, bits=bits, shares=self._lit_shares(direct))
+
+    def _lit_shares(self, direct: FractionalVisibility) -> NDArray[np.uint8]:
+        """Shares of the texels that edges cut, those behind surfaces being 0."""
+        shares, first = direct.shares.copy(), direct.starts[self.vertices]
+        lengths = direct.starts[self.vertices + 1] - first
+        row = np.repeat(np.arange(len(lengths)), lengths)
+        entries = np.arange(len(row)) + (first - np.cumsum(lengths) + lengths)[row]
+        shares[entries] *= bits_at(self.open, row, direct.texels[entries]).astype(np.uint8)
+        return shares
 
     def counts(self, vertices: Ids, texels: Ids) -> NDArray[np.bool_]:
         """Whether light of texels at vertices, (m,) each, counts for the triangles around."""

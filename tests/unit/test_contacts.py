@@ -3,9 +3,11 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.sparse
 from conftest import build, diffuse
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.matrix import Interpolated
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.planner.plan import Plan
 from mi_sparse_prt.transport.contacts import contacts
@@ -64,6 +66,34 @@ def test_only_what_touches(scene):
     assert not len(contacts(build(0.1, ball=BALL), LIGHTING).vertices)
     cube = {"type": "cube", "bsdf": WHITE}
     assert not len(contacts(build(0.2, cube=cube), LIGHTING).vertices)
+
+
+@pytest.mark.parametrize("form", ["bits", "fixed point", "shares", "any other"])
+def test_what_counts_is_as_it_was_and_the_rest_is_dark(scene, form):
+    """
+    Expected: rows of touching vertices are zero where their texels do not count, all others as before, exactly;
+        columns and relighting are those of these rows.
+    """
+    if form in ("bits", "any other"):
+        part = prt.precompute(scene, LIGHTING, Plan("exact"), max_depth=2, progress=False).direct
+    else:
+        plan = Plan("exact" if form == "fixed point" else "edges")
+        part = prt.precompute(scene, LIGHTING, plan, "texel", max_depth=2, progress=False).direct
+    if form == "any other":
+        every = scipy.sparse.eye_array(scene.n_vertices, dtype=np.float32, format="csr")
+        part = Interpolated(part, every)
+    found, n = contacts(scene, LIGHTING), LIGHTING.n_directions
+    ids, texels = np.arange(scene.n_vertices), np.arange(n)
+    counts = found.counts(np.repeat(ids, n), np.tile(texels, len(ids))).reshape(-1, n)
+    before, lit = part.rows(ids)[..., 0], found.lit(part)
+    assert before[~counts].any() and np.array_equal(
+        part.rows(ids)[..., 0], before
+    )  # the part itself is left alone
+    after = lit.rows(ids)[..., 0]
+    assert np.array_equal(after, before * counts)
+    assert np.allclose(lit.columns(texels)[..., 0], after, rtol=1e-6)
+    light = np.random.default_rng(0).random((n, 3), dtype=np.float32)
+    assert np.allclose(lit.relight(light), after @ light, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,22 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
         }
 
 
+@pytest.mark.parametrize(("target", "plan"), [(0.5, "consensus"), (1e-6, "exact")])
+def test_direct_light_that_was_tried_counts_once(grey_scene, monkeypatch, target, plan):
+    """Rays of a trial are among those of the matrix, whether the trial was good enough or all were traced after it."""
+    monkeypatch.setattr(Ranking, "uncertain", property(lambda self: "consensus"))
+    found = prt.precompute(grey_scene, LIGHTING, max_depth=2, target_error=target, progress=False)
+    consensus, exact = (
+        prt.precompute(grey_scene, LIGHTING, Plan(how), max_depth=2, progress=False)
+        for how in ("consensus", "exact")
+    )
+    assert found.report["plan"]["direct"] == plan
+    tried, every = consensus.report["rays"]["direct"], exact.report["rays"]["direct"]
+    assert 0 < tried < every
+    assert found.report["rays"]["direct"] == tried + (every if plan == "exact" else 0)
+    assert np.array_equal(found.direct.bits, (exact if plan == "exact" else consensus).direct.bits)
+
+
 @pytest.mark.parametrize(("path", "long"), [(0.05, False), (100.0, True)])
 def test_what_takes_very_long_is_left_to_the_user(path, long):
     """After a plan of some seconds, minutes are spent on a target that it missed, and days are not."""
