@@ -53,7 +53,7 @@ class Evaluation:
         checkpoint_folder: str | Path | None = None,
     ) -> None:
         self._scene, self._solver, self._settings, self._any_indirect = scene, direct, settings, indirect
-        self._clock, self._progress, self._folder = clock, progress, checkpoint_folder
+        self._clock, self.progress, self._folder = clock, progress, checkpoint_folder
         self._direct: dict[str, Parts] = {}
 
     def parts(self, plan: Plan) -> Parts:
@@ -83,7 +83,7 @@ class Evaluation:
         return matrix_of(self._scene, self._solver, parts)
 
     def _exact(self) -> Parts:
-        return exact_direct(self._solver, self._scene, self._clock, self._progress)
+        return exact_direct(self._solver, self._scene, self._clock, self.progress)
 
     def _consensus(self) -> Parts:
         state = by_consensus(self._scene, self._solver, self._clock)
@@ -94,7 +94,7 @@ class Evaluation:
     def _edges(self) -> Parts:
         """All texels' centres, and where visibility changes between these."""
         solver = DirectTransport(self._scene.normalised, self._solver.lighting, self._solver.points)
-        centres = exact_direct(solver, self._scene, self._clock, self._progress)
+        centres = exact_direct(solver, self._scene, self._clock, self.progress)
         assert isinstance(centres.direct, Visibility)
         with self._clock.phase("edges"):
             part, rays = fractional_visibility(solver, centres.direct.bits)
@@ -126,7 +126,7 @@ class Evaluation:
     def _path_traced(self, plan: Plan, light: Parts) -> Parts:
         """With paths for all elements."""
         paths, lighting = self._paths(plan), self._solver.lighting
-        part = path_traced(paths, lighting, self._clock, self._progress, self._checkpoint(plan))
+        part = path_traced(paths, lighting, self._clock, self.progress, self._checkpoint(plan))
         elements = len(paths.points) * paths.lighting.n_directions
         return replace(
             light,
@@ -142,10 +142,10 @@ class Evaluation:
         seed, checkpoint = self._settings.seed, self._checkpoint(plan)
         if plan.direct == "huang2010":
             return huang2010_parts(
-                self._scene, self._solver, paths, seed, self._clock, self._progress, checkpoint
+                self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint
             )
         return sparse_parts(
-            self._scene, self._solver, paths, seed, self._clock, self._progress, checkpoint, plan.dense
+            self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint, plan.dense
         )
 
     def _paths(self, plan: Plan) -> PathTransport:

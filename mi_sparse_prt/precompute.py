@@ -202,6 +202,8 @@ def _attempted(
             error = _judged(scene, transport, settings, settings.seed + _JUDGES + len(attempts) - 1)
         if error <= settings.target_error or not proposals.after(error):
             break
+        if evaluation.progress:
+            tqdm.write(_again(error, proposals.plan, proposals.seconds))
         attempts.append(evaluation.parts(proposals.plan))
     return _with_costs_of(attempts)
 
@@ -252,6 +254,13 @@ def _expectation(scene: Scene, lighting: CubemapLighting, expected: dict[str, fl
         f"{scene.n_vertices} vertices x {lighting.n_directions} directions: about {expected['seconds']:.0f} s "
         f"and {expected['bytes'] / 1e6:.0f} MB"
     )
+
+
+def _again(error: float, plan: Plan, seconds: float | None) -> str:
+    values = ", ".join(f"{name} {value}" for name, value in plan.parameters.items())
+    how = f"{plan.direct} direct light, {plan.indirect}" + (f" ({values})" if values else "")
+    time = "" if seconds is None else f": about {seconds:.0f} s in all by itself"
+    return f"the error is {error:.2%}, above the target; next, {how}{time}"
 
 
 def _costs(transport: LightTransport, clock: Stopwatch) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from mi_sparse_prt.planner.sparse_costs import SparseCosts
 TARGET = 0.02  # where none is given
 MARGIN = 0.95  # of a target is aimed at: predictions are off at times
 DOUBT = 2.0  # by what factor they may be off
+CLOSE = 1.2  # to a target, by what factor: few held-out elements do not tell then whether it is met
+WORTHWHILE = 0.9  # of an error is better
 TRIAL = 0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first
 
 
@@ -27,6 +29,8 @@ class Costs:
     ----------
     fixed : float
         Seconds that every plan takes: for the pilot, and for held-out elements.
+    check : float
+        Seconds that all held-out elements take once more where few of them leave in doubt whether the target is met.
     direct : dict
         ``Plan.direct`` -> its cost.
     paths, gather, sparse : PathCosts, GatherCosts, SparseCosts or None
@@ -41,6 +45,7 @@ class Costs:
     gather: GatherCosts | None = None
     sparse: SparseCosts | None = None
     direct_share: float = 1.0
+    check: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,20 +77,29 @@ def predictions(costs: Costs, target: float, spp: int | None = None) -> list[Pre
     spp : int, optional
         Paths per element instead.
     """
-    found = []
+    return sorted(
+        (
+            Predicted(plan, costs.fixed + seconds + (costs.check if _close(error, target) else 0.0), error)
+            for plan, seconds, error in _plans(costs, target, spp)
+        ),
+        key=lambda p: p.seconds,
+    )
+
+
+def _close(error: float, target: float) -> bool:
+    return target / CLOSE < error < target * CLOSE
+
+
+def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[tuple[Plan, float, float]]:
+    """All plans, with the seconds and the error of each; what all have in common is left out."""
     for name, light in costs.direct.items():
         room = math.sqrt(max((MARGIN * target) ** 2 - light.error**2, 0.0))
         for plan, seconds, error in _indirect(costs, name, room, spp):
-            found.append(
-                Predicted(plan, costs.fixed + light.seconds + seconds, math.hypot(light.error, error))
-            )
+            yield plan, light.seconds + seconds, math.hypot(light.error, error)
     if costs.sparse is not None:
         for share in DENSE:
             plan = Plan("sparse", "sparse", dense=share, spp=costs.sparse.spp)
-            found.append(
-                Predicted(plan, costs.fixed + costs.sparse.seconds(share), costs.sparse.error(share))
-            )
-    return sorted(found, key=lambda p: p.seconds)
+            yield plan, costs.sparse.seconds(share), costs.sparse.error(share)
 
 
 def choose(plans: list[Predicted], target: float | None) -> Predicted:
@@ -145,11 +159,32 @@ def _with_error_times(factor: float, costs: Costs, name: str) -> Costs:
 
 def finer(
     costs: Costs, missed: Predicted, error: float, target: float, spp: int | None = None
-) -> Predicted | None:
-    """What to do after a plan turned out to have an error above the target: as if all predictions were as far off."""
-    aim = target * missed.error / error
-    plans = [p for p in predictions(costs, aim, spp) if p.error < missed.error]
-    return choose(plans, aim) if plans else None
+) -> list[Predicted]:
+    """Plans that are more exact than one whose error was found to be above the target, the quickest first.
+
+    Gathering is off by a bias, which the error tells; other predictions are taken to be all as far off. Errors are
+    those to expect now.
+    """
+    if missed.plan.indirect == "gather":
+        plans = predictions(learned(costs, missed.plan, error), target, spp)
+    else:
+        off = error / max(missed.error, 1e-12)
+        plans = [replace(p, error=off * p.error) for p in predictions(costs, target / off, spp)]
+    return [p for p in plans if p.error < error and p.plan != missed.plan]
+
+
+def learned(costs: Costs, plan: Plan, error: float) -> Costs:
+    """Costs, after the error of a plan was found; only of gathering there is something to learn."""
+    if costs.gather is None or plan.indirect != "gather":
+        return costs
+    indirect = math.sqrt(max(error**2 - costs.direct[plan.direct].error ** 2, 0.0))
+    return replace(costs, gather=costs.gather.learned(plan.rays, plan.tolerance, indirect))
+
+
+def better(plans: list[Predicted], error: float, seconds: float) -> Predicted | None:
+    """The quickest plan that is clearly more exact than an error, and takes no longer than some seconds."""
+    good = [p for p in plans if p.error <= WORTHWHILE * error and p.seconds <= seconds]
+    return min(good, key=lambda p: p.seconds, default=None)
 
 
 def _indirect(costs: Costs, direct: str, room: float, spp: int | None) -> Iterator[tuple[Plan, float, float]]:
@@ -158,9 +193,10 @@ def _indirect(costs: Costs, direct: str, room: float, spp: int | None) -> Iterat
         yield Plan(direct, "none"), 0.0, 0.0
         return
     if costs.gather is not None:
-        for rays, tolerance in GATHER:
-            cost = costs.gather.seconds(rays, tolerance), costs.gather.error(rays, tolerance)
-            yield Plan(direct, "gather", rays, tolerance), *cost
+        for rays, finest in GATHER:
+            for tolerance in costs.gather.tolerances(rays, finest):
+                cost = costs.gather.seconds(rays, tolerance), costs.gather.error(rays, tolerance)
+                yield Plan(direct, "gather", rays, tolerance), *cost
     for resolution, seconds in costs.paths.seconds.items():
         samples = costs.paths.samples(resolution, room) if spp is None else spp
         plan = Plan(direct, "paths", resolution=resolution, spp=samples)

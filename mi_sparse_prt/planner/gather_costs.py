@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,19 +17,24 @@ from mi_sparse_prt.reconstruction.nodes import NODES
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.contacts import contacts
 from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.first_bounce import FEW_ROWS, MIXED, ROWS
+from mi_sparse_prt.transport.first_bounce import FEW_ROWS, MIXED, MOST, ROWS
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
 from mi_sparse_prt.transport.sparse_product import product
 from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 FEW, MANY = 64, 256  # rays per vertex of a pilot
 TIMED = 2048  # rays per vertex, where these are timed
-TEXELS = 192  # in common, of which the rank is told
+SAMPLE = 256  # vertices, and as many texels, that tell the rank
+FINE = 0.03  # tolerance below which a sample tells little
+HALVES = 4  # of that sample: what half of it tells is a mean over so many
 WIDTH = 64  # vectors at a time, for a timed product
 BLOCK = 1024  # rows at a time, likewise
 REPEATED = 32  # times the rows of G of a pilot
 EXPANSION = 40  # multiplications that expanding an element of D takes as long as
 SQUARES = 6  # products of a basis with itself: orthogonal ones are made of it before each bounce
+COMBINED = 30e-9  # seconds for each number of the combinations that make a basis: most of it is new pages ...
+BLOCKS = 192  # ... and as many of these are begun at least
+DISTINCT = 1.2  # tolerances that are closer than this factor are as good as one
 LATER = 2  # bounces after the first one
 GROUPS = 5  # of vertices, for a bias that a few of them do not decide
 
@@ -51,7 +56,7 @@ class GatherCosts:
         Seconds of an entry of G times one column.
     entries : float
         Of G, per ray.
-    noise : dict
+    noise_of : dict
         Rays -> relative L2 error of the whole matrix.
     bias : float
         That of interpolation between vertices, which no number of rays removes; a typical one.
@@ -59,8 +64,8 @@ class GatherCosts:
         Norm of the first bounce, relative to the whole matrix.
     growth : float
         How much larger the norm of all bounces is.
-    spectrum : (k,) float
-        Energy that is left of the first bounce beyond each rank, relative.
+    spectra : (2, k) float
+        Energy that is left of the first bounce beyond each rank, relative, in half the sample and in all of it.
     """
 
     vertices: int
@@ -70,11 +75,11 @@ class GatherCosts:
     multiplication: float
     addition: float
     entries: float
-    noise: dict[int, float]
+    noise_of: dict[int, float]
     bias: float
     first: float
     growth: float
-    spectrum: NDArray[np.float64]
+    spectra: NDArray[np.float64]
 
     def error(self, rays: int, tolerance: float) -> float:
         """Predicted relative L2 error of the whole matrix.
@@ -82,18 +87,42 @@ class GatherCosts:
         Of the first bounce's errors only the bias is carried on into the next ones: noise, and what a low rank leaves
         out, differ from vertex to vertex and are averaged by gathering.
         """
-        fall = math.log(max(self.noise[FEW], 1e-12) / max(self.noise[MANY], 1e-12)) / math.log(MANY / FEW)
-        noise = self.noise[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
-        return math.sqrt(noise**2 + (self.growth * self.bias) ** 2 + (tolerance * self.first) ** 2)
+        noise, bias = self.noise(rays), self.growth * self.bias
+        return math.sqrt(noise**2 + bias**2 + (tolerance * self.first) ** 2)
+
+    def learned(self, rays: int, tolerance: float, error: float) -> GatherCosts:
+        """The same, after this error was found: the bias is what a pilot knows least."""
+        bias = math.sqrt(
+            max(error**2 - self.error(rays, tolerance) ** 2 + (self.growth * self.bias) ** 2, 0.0)
+        )
+        return replace(self, bias=bias / self.growth)
+
+    def noise(self, rays: int) -> float:
+        """Relative L2 error of the whole matrix that comes from the number of rays."""
+        few, many = (max(self.noise_of[count], 1e-12) for count in (FEW, MANY))
+        fall = math.log(few / many) / math.log(MANY / FEW)
+        return self.noise_of[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
+
+    def tolerances(self, rays: int, finest: float) -> tuple[float, ...]:
+        """Tolerances of the rank to consider: the finest, and one that leaves out as much as there is noise.
+
+        Noise differs from vertex to vertex, and has the full rank: to keep more than it is to keep noise.
+        """
+        noise = round(self.noise(rays) / max(self.first, 1e-150), 2)
+        return (finest, noise) if DISTINCT * finest < noise < 1 else (finest,)
 
     def rank(self, tolerance: float) -> float:
         """Predicted rank of the first bounce.
 
-        A few vertices and texels have a lower one than all of them. On the bunny (64,000 vertices, 6144 texels) 18 and
-        33 stood for 65 and 136, in the box and on the terrace 48 and 49 for 352 and 378.
+        A sample has a lower one than the matrix: where all is smooth by little, where surfaces are fine by much. It
+        grows on as it did from half the sample on, the longer the more light may be lacking. Six scenes told how long;
+        the ranks of these, above 65, are met within a factor of 2.4.
         """
-        few = int(np.searchsorted(-self.spectrum, -(tolerance**2)))
-        return 65 * (few / 18) ** 1.25 * max(few / 33, 1.0) ** 1.25
+        seen = max(tolerance, FINE)
+        half, whole = (float(np.searchsorted(-x, -(seen**2))) for x in self.spectra)
+        doublings = min(3 + math.log2(seen / FINE), 4.0)
+        grown = whole * max(whole / max(half, 1.0), 1.0) ** doublings * (seen / tolerance) ** 0.4
+        return min(grown, self.vertices, self.directions, MOST)
 
     def seconds(self, rays: int, tolerance: float) -> float:
         """Predicted time of rays and interreflections: the terms are the steps of ``transport.first_bounce``."""
@@ -104,7 +133,8 @@ class GatherCosts:
         dense = EXPANSION * expanded + rows * rank * self.directions * self.channels + squares
         bounces = nodes * entries * rank * (1 + LATER * self.channels)
         sparse = bounces + min(rows, nodes) * entries * self.directions * self.channels
-        return nodes * rays * self.ray + self.multiplication * dense + self.addition * sparse
+        made = nodes * rays * self.ray + COMBINED * nodes * (rank + BLOCKS)
+        return made + self.multiplication * dense + self.addition * sparse
 
 
 def gather_costs(
@@ -153,7 +183,7 @@ def gather_costs(
         math.sqrt(max(bias, 0.0)),
         sizes[0],
         max(sizes[1] / max(sizes[0], 1e-150), 1.0),
-        pilot.spectrum(few[0], held.stand_for, seed),
+        pilot.spectra(seed),
     )
 
 
@@ -211,13 +241,22 @@ class _Pilot:
         reflected = seen[:, :, None] * self._albedo[rays.indices][:, None]  # [entry, texel, channel]
         return (mean @ reflected.reshape(len(row), -1)).reshape(*texels.shape, -1).astype(np.float64)
 
-    def spectrum(
-        self, rays: scipy.sparse.csr_array, stand_for: NDArray[np.float64], seed: int
-    ) -> NDArray[np.float64]:
-        """Energy of the first bounce beyond each rank, relative, at texels that all vertices share."""
-        n = self._direct.lighting.n_directions
-        texels = np.random.default_rng(seed).choice(n, min(n, TEXELS), replace=False)
-        light = self.light(rays, np.tile(texels, (len(stand_for), 1)))[:, :, 0] * np.sqrt(stand_for)[:, None]
-        squares = np.linalg.svd(light, compute_uv=False) ** 2
-        total = float(squares.sum())
-        return 1 - np.cumsum(squares) / total if total > 0 else np.zeros(len(squares))
+    def spectra(self, seed: int) -> NDArray[np.float64]:
+        """Energy of the first bounce beyond each rank, relative, in half a sample and in all of it (2, k)."""
+        n, rng = self._direct.lighting.n_directions, np.random.default_rng([seed, 2])
+        texels = rng.choice(n, min(n, SAMPLE), replace=False)
+        vertices = rng.choice(len(self._albedo), min(len(self._albedo), SAMPLE), replace=False)
+        sample = _Pilot(self._scene, self._direct, vertices)
+        light = sample.light(sample.rays(FEW, seed), np.tile(texels, (len(vertices), 1)))[:, :, 0]
+        halves = [np.array_split(rng.permutation(k), 2)[0] for k in light.shape * HALVES]
+        some = [_beyond(light[np.ix_(*pair)]) for pair in zip(halves[::2], halves[1::2], strict=True)]
+        whole = _beyond(light)
+        half = np.mean(some, axis=0)
+        return np.stack([np.pad(half, (0, len(whole) - len(half))), whole])
+
+
+def _beyond(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Energy beyond each rank, relative."""
+    squares = np.linalg.svd(light, compute_uv=False) ** 2
+    total = float(squares.sum())
+    return 1 - np.cumsum(squares) / total if total > 0 else np.zeros(len(squares))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from mi_sparse_prt.planner.choice import MARGIN, TARGET, Costs, choose, predictions
 from mi_sparse_prt.planner.direct_costs import consensus_cost, edges_cost, exact_cost
 from mi_sparse_prt.planner.gather_costs import gather_costs
@@ -29,7 +27,7 @@ TEXELS = 16
 SEEDS = 1 << 20  # apart from those of the matrix
 LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samples per element
 FEW_JUDGES = 0.25  # of the held-out elements: these mostly tell whether a target is met
-CHECK = 0.3  # seconds of a check by held-out elements, beside its paths
+DRAWN = 1.2e-6  # seconds per element of a check that is drawn for direct light
 
 
 def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect: bool) -> Costs:
@@ -59,8 +57,10 @@ def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect:
         light["consensus"] = consensus_cost(scene, direct, held, seed)
     elif auto:
         light["edges"] = edges_cost(scene, direct, held)
-    checks = 1 if settings.target_error is None else 1 + FEW_JUDGES
-    costs = Costs(checks * _check(held), light, direct_share=held.share(held.direct))
+    check = _check(held)
+    costs = Costs(check, light, direct_share=held.share(held.direct))
+    if settings.target_error is not None:
+        costs = replace(costs, fixed=(1 + FEW_JUDGES) * check, check=check)
     if not indirect:
         return costs
     path = seconds_of_a_path(scene, settings, lighting)
@@ -86,10 +86,10 @@ def _too_dear(costs: Costs, settings: Settings, path: float, noise: float) -> bo
 
 
 def _check(held: PilotElements) -> float:
-    """Seconds of the check by held-out elements: nearly all of it is paths."""
+    """Seconds of a check by held-out elements."""
+    totals = [int(size) * held.lighting.n_directions for size in held.sizes]
+    drawn = DRAWN * sum(chosen.rays_of(total) for total in totals)
     if held.indirect is None:
-        return CHECK
-    sizes = held.sizes * held.lighting.n_directions  # [mesh]
-    share = max(chosen.PATHS // len(sizes), chosen.FEW_PATHS)
-    counts = np.maximum(np.minimum(share, sizes // 16), np.minimum(chosen.FEWEST_PATHS, sizes))
-    return CHECK + float(counts.sum()) * held_out.SPP * held.indirect.seconds
+        return drawn
+    paths = sum(chosen.paths_of(total, len(totals)) for total in totals)
+    return drawn + paths * held_out.SPP * held.indirect.seconds

@@ -10,9 +10,11 @@ from mi_sparse_prt.planner.choice import (
     TARGET,
     Costs,
     Predicted,
+    better,
     choose,
     choose_first,
     finer,
+    learned,
     predictions,
     uncertain,
 )
@@ -111,15 +113,21 @@ class Ranking:
         self._rank(replace(costs, fixed=fixed, direct=costs.direct | {direct: found}))
 
     def after(self, error: float) -> bool:
-        """Go on to a finer plan, the present one having this error; False if none meets the target in sensible time."""
-        target = self._settings.target_error
+        """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
+
+        Where what would meet the target takes too long, the next one is at least clearly more exact.
+        """
+        settings, target = self._settings, self._settings.target_error
         if target is None or len(self._tried) == ATTEMPTS:
             return False
-        found = finer(self._costs, self._best, error, target, self._settings.spp)
+        plans = finer(self._costs, self._best, error, target, settings.spp)
+        self._costs = learned(self._costs, self._best.plan, error)
+        patience = PATIENCE * sum(p.seconds for p in self._tried)
+        found = choose(plans, target) if plans else None
+        if found is not None and found.seconds > patience:
+            self.too_long = found if found.error <= target else None
+            found = better(plans, error, patience)
         if found is None:
-            return False
-        if found.seconds > PATIENCE * sum(p.seconds for p in self._tried):
-            self.too_long = found
             return False
         self._best = found
         self._plans.append(found)

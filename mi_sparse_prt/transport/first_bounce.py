@@ -29,6 +29,9 @@ PROJECTIONS = 24  # that tell leverage within 30%
 ROWS = 4  # times the rank
 FEW_ROWS = 1024  # of which all are taken
 BASES = 0.75  # of the squared tolerance: the last of the energy takes a random basis many vectors
+MOST = (
+    1024  # vectors in a basis, about: time grows as their square, and what is left out then is mostly noise
+)
 PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
 
 Floats = NDArray[np.float32]
@@ -76,7 +79,7 @@ def first_bounce(
     keys : (n,) uint64
         Of the rows of G: random numbers are made of them.
     tolerance : float
-        Relative L2 error.
+        Relative L2 error; it is larger where that would take a rank far above 1000.
     seed : int
 
     Returns
@@ -125,7 +128,7 @@ def _basis(
         missed = max(float(np.trace(rest)), 0) / energy * _amplification(len(known), len(block), len(new))
         squares, vectors = np.linalg.eigh(rest)
         kept = squares > (PRECISION / 2) ** 2 * energy
-        if missed <= BASES * tolerance**2 or not kept.any():
+        if missed <= BASES * tolerance**2 or not kept.any() or len(known) >= MOST:
             return np.hstack([*blocks, block[:, :0]]), turn, missed
         steps = vectors[:, kept] / np.sqrt(squares[kept])
         turn = np.block([[turn, -turn @ (known @ steps)], [np.zeros((len(steps), turn.shape[1])), steps]])
@@ -151,7 +154,7 @@ def _combinations(
     for rho in albedo:
         mixed = np.hstack([light.combined(MIXED, rng) for _ in range(draws)])
         found.append(gathered(matrix, rho[None], mixed)[0])
-    return np.hstack(found)
+    return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
 
 
 def _amplification(rank: int, n: int, sums: int) -> float:

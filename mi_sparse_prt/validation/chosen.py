@@ -78,8 +78,7 @@ def for_direct_light(
         Of the usual number of elements.
     """
     lighting, part = transport.lighting, transport.direct
-    total = (inside.stop - inside.start) * lighting.n_directions
-    rays = effort * max(RAYS * total, min(total / 4, FEWEST_RAYS))
+    rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
     floor = 0.0
     if not isinstance(part, Visibility):
         rays, floor = rays / FEW, BELOW_HORIZON
@@ -95,6 +94,17 @@ def for_direct_light(
     kept = near | (rng.random(len(near)) < FAR_FROM_EDGES)
     weights = found.weights / np.where(near, 1.0, FAR_FROM_EDGES)
     return Chosen(found.vertices[kept], found.texels[kept], weights[kept])
+
+
+def rays_of(total: int) -> float:
+    """How many elements of so many are drawn for direct light that is bits, about."""
+    return max(RAYS * total, min(total / 4, FEWEST_RAYS))
+
+
+def paths_of(total: int, n_meshes: int, effort: float = 1.0) -> int:
+    """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""
+    share = max(PATHS // n_meshes, FEW_PATHS)
+    return max(round(effort * min(share, total // 16)), min(FEWEST_PATHS, total))
 
 
 def for_indirect_light(
@@ -114,8 +124,7 @@ def for_indirect_light(
     """
     assert transport.indirect is not None
     total = (inside.stop - inside.start) * transport.lighting.n_directions
-    share = max(PATHS // len(transport.meshes), FEW_PATHS)
-    count = max(round(effort * min(share, total // 16)), min(FEWEST_PATHS, total))
+    count = paths_of(total, len(transport.meshes), effort)
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start

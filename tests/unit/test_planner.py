@@ -32,6 +32,7 @@ from mi_sparse_prt.planner.proposals import Ranking
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.settings import Settings
 from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.first_bounce import MOST
 from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 LIGHTING = prt.CubemapLighting(4)
@@ -52,6 +53,22 @@ class FakeGather(GatherCosts):
 
     def error(self, rays: int, tolerance: float) -> float:
         return 0.08 / math.sqrt(rays / 16)
+
+    def tolerances(self, rays: int, finest: float) -> tuple[float, ...]:
+        return (finest,)
+
+    def learned(self, rays: int, tolerance: float, error: float) -> GatherCosts:
+        return BiasedGather(math.sqrt(error**2 - FakeGather.error(self, rays, tolerance) ** 2))
+
+
+class BiasedGather(FakeGather):
+    """With a bias that no rays remove."""
+
+    def __init__(self, bias: float) -> None:
+        self.of_bias = bias
+
+    def error(self, rays: int, tolerance: float) -> float:
+        return math.hypot(super().error(rays, tolerance), self.of_bias)
 
 
 def best(costs: Costs, target: float, spp: int | None = None) -> Predicted:
@@ -107,7 +124,7 @@ def test_without_a_target_nobody_waits_for_hours():
     assert trial.plan.indirect == "sparse" and trial.seconds < 0.1 * 6 * 3600
     assert choose_first(plans, None) == choose(plans, None)
     hours = choose(plans, 0.02)
-    assert finer(costs, trial, trial.error, 0.02) == hours
+    assert choose(finer(costs, trial, trial.error, 0.02), 0.02) == hours
     assert (hours.plan.indirect, hours.error) == ("paths", pytest.approx(MARGIN * 0.02, rel=0.01))
     assert hours.seconds > 6 * 3600
     usual = choose(plans, None)
@@ -122,14 +139,79 @@ def test_given_samples_are_kept():
 
 
 def test_after_a_miss_as_if_all_predictions_were_as_far_off():
+    """But of gathering a bias is learned, which more rays do not remove."""
     costs = Costs(0, EXACT, None, None)
-    direct = best(costs, 0.02)
-    assert finer(costs, direct, 0.03, 0.02) is None
+    assert finer(costs, best(costs, 0.02), 0.03, 0.02) == []
+    costs = Costs(0, EXACT, PATHS)
+    first = Predicted(Plan("exact", "paths", resolution=16, spp=16), 410.0, 0.05)
+    plans = finer(costs, first, 0.1, 0.06)
+    assert all(p.error < 0.1 for p in plans)
+    # twice as far off: what was predicted at 3% has 6%
+    assert choose(plans, 0.06).error == pytest.approx(MARGIN * 0.06, rel=0.01)
+    assert choose(plans, 0.06).plan.spp == math.ceil(0.09 / (MARGIN * 0.03) ** 2)
     costs = Costs(0, EXACT, PATHS, FakeGather())
     first = best(costs, 0.025)
     assert (first.plan.rays, first.error) == (256, pytest.approx(0.02))
-    assert finer(costs, first, 0.03, 0.025).plan.rays == 1024  # 1% is within 2.5% x 2 / 3
-    assert finer(costs, first, 0.07, 0.025).plan.rays == 4096
+    after = {p.plan.rays: p.error for p in finer(costs, first, 0.025, 0.02) if p.plan.indirect == "gather"}
+    bias = math.sqrt(0.025**2 - 0.02**2)  # 1.5%
+    assert after == {
+        1024: pytest.approx(math.hypot(0.01, bias)),
+        4096: pytest.approx(math.hypot(0.005, bias)),
+    }
+
+
+def test_gathering_learns_its_bias(grey_scene):
+    """The error that was found is then the one that is predicted, and noise falls from there."""
+    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
+    costs = measure(grey_scene, direct, Settings(4, max_depth=4), indirect=True).gather
+    assert costs is not None
+    for error in (0.5 * costs.error(64, 0.06), 2 * costs.error(64, 0.06)):
+        now = costs.learned(64, 0.06, error)
+        least = math.hypot(costs.noise(64), 0.06 * costs.first)
+        assert now.error(64, 0.06) == pytest.approx(max(error, least))
+        assert now.error(1024, 0.06) <= now.error(256, 0.06) <= now.error(64, 0.06)
+
+
+def test_noise_of_rays_is_not_worth_a_rank():
+    """A tolerance of what the noise is stands beside the finest one, where that is less by more than a little."""
+
+    def costs(noise: float) -> GatherCosts:
+        spectra = np.zeros((2, 4))
+        return GatherCosts(
+            100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, {64: noise, 256: noise / 2}, 0.0, 0.1, 1.2, spectra
+        )
+
+    assert costs(0.02).tolerances(64, 0.06) == (0.06, 0.2)
+    assert costs(0.02).tolerances(256, 0.03) == (0.03, 0.1)
+    assert costs(0.02).tolerances(1024, 0.06) == (0.06,)
+    assert costs(0.007).tolerances(64, 0.06) == (0.06,)
+    assert costs(0.2).tolerances(64, 0.06) == (0.06,)  # more noise than light: nothing is to be told from it
+
+
+def test_a_rank_grows_as_it_did_within_the_sample():
+    """
+    Expected: that of the sample where half of it has as much, one that is far larger where all of it has twice as
+        much; and never more than the matrix has, or than a basis may get.
+    """
+
+    def rank(half: int, whole: int, **sizes: int) -> float:
+        spectra = (np.arange(256) < np.array([[half], [whole]])).astype(float)
+        known = {"vertices": 50_000, "directions": 6144} | sizes
+        return GatherCosts(
+            known["vertices"], known["directions"], 1, 0, 0, 0, 0.5, {64: 0.1, 256: 0.05}, 0, 0.1, 1, spectra
+        ).rank(0.03)
+
+    assert rank(20, 20) == pytest.approx(20)
+    assert rank(20, 40) == pytest.approx(40 * 2**3)
+    assert rank(20, 40, directions=96) == 96
+    assert rank(20, 40, vertices=100) == 100
+    assert rank(100, 200) == MOST
+
+
+def test_what_is_close_to_the_target_is_judged_once_more():
+    costs = Costs(1.0, EXACT, PATHS, FakeGather(), check=3.0)
+    by_rays = {p.plan.rays: p.seconds for p in predictions(costs, 0.022) if p.plan.indirect == "gather"}
+    assert by_rays == {64: 1 + 10 + 0.64, 256: 1 + 10 + 2.56 + 3, 1024: 1 + 10 + 10.24, 4096: 1 + 10 + 40.96}
 
 
 def test_direct_light_that_the_choice_depends_on_is_found_first():
@@ -182,6 +264,21 @@ def test_what_takes_very_long_is_left_to_the_user(path, long):
         assert ranking.too_long.seconds > 20 * ranking.seconds
     else:
         assert ranking.plan.indirect == "paths" and ranking.too_long is None
+
+
+def test_short_of_what_takes_very_long_there_is_something_better():
+    """
+    Scenario: gathering with 64 rays misses the target, by noise for the most part; paths would take days.
+    Expected: more rays, as they promise a clearly smaller error; and that the days are spoken of. No third attempt once
+        the noise is small beside the bias.
+    """
+    paths = PathCosts({32: 1e5}, {32: 0.3}, {32: 0.0})
+    ranking = Ranking(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.043))
+    assert (ranking.plan.indirect, ranking.plan.rays) == ("gather", 64)
+    assert ranking.after(0.06)  # 4% of noise, 4.5% of bias
+    assert (ranking.plan.indirect, ranking.plan.rays) == ("gather", 256)
+    assert ranking.too_long is not None and ranking.too_long.plan.indirect == "paths"
+    assert not ranking.after(0.05)  # 2% of noise
 
 
 def test_a_report_is_json():
