@@ -313,6 +313,18 @@ def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
     assert missing == pytest.approx(found.left_out, rel=0.25)
 
 
+def test_a_basis_has_an_end(coloured_scene, monkeypatch):
+    """More vectors than the most are not looked for: it is said how much is missing, and that much is."""
+    monkeypatch.setattr(bounce_module, "MOST", 16)
+    gather, direct = solver(coloured_scene, 8, max_depth=3), visibility(coloured_scene, 8)
+    found = gather.indirect(direct, tolerance=0.001)
+    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
+    assert max(found.ranks) <= 16 + 96  # combinations join by blocks
+    assert found.left_out > 0.01
+    missing = relative(found.columns(np.arange(384)), known)
+    assert missing == pytest.approx(found.left_out, rel=0.25)
+
+
 @dataclass(frozen=True)
 class SomePart:
     """A direct part that is none of those known by type."""
