@@ -88,7 +88,8 @@ class Command:
         watcher = threading.Thread(target=watch, daemon=True)
         watcher.start()
         try:
-            yield
+            with _quiet_callbacks():
+                yield
         finally:
             finished.set()
             signal.set_wakeup_fd(usual)
@@ -96,6 +97,22 @@ class Command:
             watcher.join()
             os.close(reader)
             os.close(writer)
+
+
+@contextmanager
+def _quiet_callbacks() -> Iterator[None]:
+    """No traceback where Ctrl-C meets a callback, which cannot raise it: numba's compiler has some."""
+    usual = sys.unraisablehook
+
+    def hook(found: sys.UnraisableHookArgs) -> None:
+        if not issubclass(found.exc_type, KeyboardInterrupt):
+            usual(found)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
 
 
 @contextmanager

@@ -1,11 +1,14 @@
 """Ctrl-C on the real program, in the middle of its work."""
 
+import ctypes
 import signal
 import subprocess
 import sys
 import time
 
 import pytest
+
+from mi_sparse_prt.cli.running import Command
 
 # Light that bounces in a nearly white box until the paths are long: a wavefront takes seconds.
 SCENE = """<scene version="3.0.0">
@@ -83,3 +86,22 @@ def test_ctrl_c_leaves_nothing(tmp_path, phase):
     assert "Traceback" not in errors
     assert [p.name for p in tmp_path.iterdir()] == ["scene.xml"]
     assert waited < 2.0
+
+
+def test_ctrl_c_in_a_callback(monkeypatch):
+    """One that cannot raise shows nothing; other trouble there does, and so does Ctrl-C once no command runs."""
+    shown: list[type] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda found: shown.append(found.exc_type))
+
+    def called_back(error: BaseException) -> None:
+        def work() -> int:
+            raise error
+
+        ctypes.PYFUNCTYPE(ctypes.c_int)(work)()
+
+    with Command(quiet=True).prompt_interrupts():
+        called_back(KeyboardInterrupt())
+        called_back(ValueError("trouble"))
+    assert shown == [ValueError]
+    called_back(KeyboardInterrupt())
+    assert shown == [ValueError, KeyboardInterrupt]
