@@ -23,7 +23,7 @@ from mi_sparse_prt.planner.plan import EFFORTS, Plan
 from mi_sparse_prt.settings import Settings
 
 ATTEMPTS = 4
-PATIENCE = 20.0  # times what all attempts were to take: what is to take longer is left to the user
+PATIENCE = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
 
 
 class Ladder:
@@ -122,7 +122,7 @@ class Ranking:
             return False
         plans = finer(self._costs, self._best, error, target, settings.spp)
         self._costs = learned(self._costs, self._best.plan, error)
-        patience = PATIENCE * sum(p.seconds for p in self._tried)
+        patience = PATIENCE * self._tried[0].seconds
         found = choose(plans, target) if plans else None
         if found is not None and found.seconds > patience:
             self.too_long = found if found.error <= target else None

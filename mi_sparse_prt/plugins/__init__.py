@@ -3,12 +3,15 @@
 import mitsuba as mi
 
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
+from mi_sparse_prt.plugins.glossy import AshikhminShirley, Phong
 from mi_sparse_prt.plugins.mesh_vertices import MeshVertices
 from mi_sparse_prt.plugins.sparse_prt import SparsePRT
 
 
 def register() -> None:
-    """Make ``mesh_vertices``, ``cubemap`` and ``sparse_prt`` known to Mitsuba's XML and dict loaders."""
+    """Make the plugins known to Mitsuba's XML and dict loaders."""
     mi.register_sensor("mesh_vertices", MeshVertices)
     mi.register_emitter("cubemap", CubemapEmitter)
     mi.register_integrator("sparse_prt", SparsePRT)
+    mi.register_bsdf("phong", Phong)
+    mi.register_bsdf("ashikhmin_shirley", AshikhminShirley)
