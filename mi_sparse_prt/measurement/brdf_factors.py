@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.errors import PrtError
 
-TERMS = 4  # [HR10]
 MOST_TERMS = 16
 HEIGHTS, AZIMUTHS = 64, 128  # of incident and of outgoing directions
 LEFT_OVER = 16  # vectors more than terms that a basis begins with

@@ -29,9 +29,7 @@ PROJECTIONS = 24  # that tell leverage within 30%
 ROWS = 4  # times the rank
 FEW_ROWS = 1024  # of which all are taken
 BASES = 0.75  # of the squared tolerance: the last of the energy takes a random basis many vectors
-MOST = (
-    1024  # vectors in a basis, about: time grows as their square, and what is left out then is mostly noise
-)
+MOST = 1024  # vectors in a basis, about: time grows as their square, and what is left is mostly noise
 PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
 
 Floats = NDArray[np.float32]
