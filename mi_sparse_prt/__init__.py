@@ -16,8 +16,10 @@ except PrtError as _error:
         raise SystemExit(f"mi-sparse-prt: {_error}") from None
     raise
 
+from .compression.compress import compress  # noqa: E402
 from .emission.cubemap import CubemapLighting  # noqa: E402
 from .emission.environment import Environment, load_environment  # noqa: E402
+from .glossy import GlossyTransport, precompute_glossy  # noqa: E402
 from .matrix import LightTransport  # noqa: E402
 from .plugins import register as _register_plugins  # noqa: E402
 from .precompute import precompute  # noqa: E402
@@ -31,16 +33,19 @@ _register_plugins()
 __all__ = [
     "CubemapLighting",
     "Environment",
+    "GlossyTransport",
     "LightTransport",
     "PrtError",
     "PrtWarning",
     "Scene",
     "Validation",
     "__version__",
+    "compress",
     "load_environment",
     "load_scene",
     "load_transport",
     "precompute",
+    "precompute_glossy",
     "render",
     "validate",
     "variant",

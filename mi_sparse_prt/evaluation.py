@@ -168,6 +168,7 @@ def matrix_of(scene: Scene, direct: DirectTransport, parts: Parts) -> LightTrans
         lighting=direct.lighting,
         basis=direct.basis,
         albedo=scene.albedo,
+        areas=scene.vertex_areas,
         direct=parts.direct,
         indirect=parts.indirect,
         meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import BITS, bit_of
+from mi_sparse_prt.blocks import rows_times
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 FULL = 255  # a share of 1
@@ -65,6 +66,9 @@ class FractionalVisibility:
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
         listed = self.starts, self.texels, self.shares
         return _relight(self.bits, *listed, self.normals, directions, ramps, power)
+
+    def project(self, vectors: Floats) -> Floats:
+        return rows_times(self.rows, len(self.bits), vectors)
 
     def reordered(self, source: Ids) -> FractionalVisibility:
         """Some rows, in this order."""

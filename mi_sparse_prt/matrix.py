@@ -17,6 +17,9 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.bits import BITS
+from mi_sparse_prt.blocks import in_blocks, rows_times
+from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
@@ -45,6 +48,16 @@ class Part(Protocol):
         """Bytes that the part keeps in memory."""
 
 
+class StoredPart(Part, Protocol):
+    """A part that a matrix keeps."""
+
+    def reordered(self, source: Rows) -> StoredPart:
+        """Some rows, in this order."""
+
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Products (n_v, k, channels) with vectors (n_directions, k), the same for all channels."""
+
+
 @dataclass(frozen=True)
 class Visibility:
     """Direct light in the direction basis: one bit per element, cosine and solid angle analytic.
@@ -66,10 +79,8 @@ class Visibility:
         return self.bits.nbytes
 
     def rows(self, ids: Rows) -> NDArray[np.float32]:
-        directions = self.lighting.directions
-        seen = np.unpackbits(self.bits[ids].view(np.uint8), axis=1, bitorder="little")[:, : len(directions)]
-        white = np.maximum(self.normals[ids] @ directions.T, 0) * self._weights()  # [row, direction]
-        return (white * seen)[..., None]
+        beams = np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
+        return _expanded_bits(self.bits, self.normals, np.asarray(ids, np.int64), beams)[..., None]
 
     def columns(self, ids: Rows) -> NDArray[np.float32]:
         ids = np.asarray(ids)
@@ -86,11 +97,33 @@ class Visibility:
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
         return _relight_bits(self.bits, self.normals, directions, power)
 
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        return rows_times(self.rows, len(self.bits), vectors)
+
     def reordered(self, source: Rows) -> Visibility:
         return replace(self, bits=self.bits[source], normals=self.normals[source])
 
     def _weights(self) -> NDArray[np.float32]:
         return self.lighting.solid_angles / np.float32(np.pi)
+
+
+@numba.njit(parallel=True, cache=True)
+def _expanded_bits(
+    bits: NDArray[np.uint32], normals: NDArray[np.float32], ids: NDArray[np.int64], beams: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Elements (n, m) of rows ``ids``; beams (3, m) are directions times power."""
+    result = np.zeros((len(ids), beams.shape[1]), np.float32)
+    for i in numba.prange(len(ids)):
+        nx, ny, nz = normals[ids[i], 0], normals[ids[i], 1], normals[ids[i], 2]
+        for word in range(bits.shape[1]):
+            mask = bits[ids[i], word]
+            if mask == 0:
+                continue
+            for j in range(word * 32, min(word * 32 + 32, beams.shape[1])):
+                cosine = nx * beams[0, j] + ny * beams[1, j] + nz * beams[2, j]
+                seen = np.float32((mask >> np.uint32(j % 32)) & np.uint32(1))
+                result[i, j] = max(cosine, np.float32(0)) * seen
+    return result
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
@@ -145,7 +178,10 @@ class MeanCosine:
         return (self.fixed[:, ids] * self._weights()[ids])[..., None]
 
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        return _in_blocks(self.fixed, lighting * self._weights()[:, None])
+        return in_blocks(self.fixed, lighting * self._weights()[:, None])
+
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        return in_blocks(self.fixed, vectors * self._weights()[:, None])[..., None]
 
     def reordered(self, source: Rows) -> MeanCosine:
         return replace(self, fixed=self.fixed[source])
@@ -191,9 +227,14 @@ class Indirect:
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
         coarse = self.upsampling.T @ (lighting * self.lighting.solid_angles[:, None])  # [coarse, rgb]
         if self.density.shape[2] == 1:
-            return _in_blocks(self.density[..., 0], coarse)
-        channels = [_in_blocks(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
+            return in_blocks(self.density[..., 0], coarse)
+        channels = [in_blocks(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
         return np.concatenate(channels, axis=1)
+
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        coarse = self.upsampling.T @ (vectors * self.lighting.solid_angles[:, None])  # [coarse, vector]
+        channels = [in_blocks(self.density[..., c], coarse) for c in range(self.density.shape[2])]
+        return np.stack(channels, axis=-1)
 
     def reordered(self, source: Rows) -> Indirect:
         return replace(self, density=self.density[source])
@@ -235,6 +276,10 @@ class Interpolated:
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
         return self.weights @ self.dense.relight(lighting)
 
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        dense = self.dense.project(vectors)  # [dense row, vector, channel]
+        return (self.weights @ dense.reshape(len(dense), -1)).reshape(-1, *dense.shape[1:])
+
     def reordered(self, source: Rows) -> Interpolated:
         return replace(self, weights=self.weights[source])
 
@@ -274,16 +319,11 @@ class Factored:
         channels = zip(self.left, self.right, lighting.T, strict=True)
         return np.stack([a @ (b @ light) for a, b, light in channels], axis=-1)
 
+    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.stack([a @ (b @ vectors) for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+
     def reordered(self, source: Rows) -> Factored:
         return replace(self, left=tuple(left[source] for left in self.left))
-
-
-def _in_blocks(matrix: NDArray[Any], vectors: NDArray[np.float32], block: int = 4096) -> NDArray[np.float32]:
-    """A product with a matrix of small numbers, converted to float32 one block of rows at a time."""
-    product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
-    for a in range(0, len(matrix), block):
-        product[a : a + block] = matrix[a : a + block].astype(np.float32) @ vectors
-    return product
 
 
 @dataclass(frozen=True)
@@ -303,8 +343,10 @@ class LightTransport:
     lighting : CubemapLighting
     basis : {"direction", "texel"}
     albedo : (n_v, 3) float32
+    areas : (n_v,) float32
+        Of the surface around each vertex, world units.
     direct, indirect : Part or None
-        White parts; None where there is no such light.
+        White parts; None where there is no such light. A compressed matrix has both together, as ``direct``.
     meshes : tuple of MeshRange
     vertex_keys : (n_v,) uint64
         Identify rows whatever their order (``Points.keys``).
@@ -316,7 +358,8 @@ class LightTransport:
     lighting: CubemapLighting
     basis: str
     albedo: NDArray[np.float32]
-    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated
+    areas: NDArray[np.float32]
+    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated | Clustered | HaarRows
     indirect: Indirect | Interpolated | Factored | None
     meshes: tuple[MeshRange, ...]
     vertex_keys: NDArray[np.uint64]
@@ -351,8 +394,7 @@ class LightTransport:
             If an index is out of range.
         """
         chosen = _checked(ids, len(self.albedo), "vertex")
-        white = _summed([part.rows(chosen) for part in self._parts()])
-        return self.albedo[chosen][:, None, :] * white
+        return self.albedo[chosen][:, None, :] * self.white_rows(chosen)
 
     def columns(self, ids: ArrayLike) -> NDArray[np.float32]:
         """Columns of T: radiance leaving all vertices under light from one texel each.
@@ -422,6 +464,7 @@ class LightTransport:
         return replace(
             self,
             albedo=self.albedo[source],
+            areas=self.areas[source],
             direct=self.direct.reordered(source),
             indirect=self.indirect and self.indirect.reordered(source),
             meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
@@ -434,7 +477,15 @@ class LightTransport:
 
         save(self, path)
 
-    def _parts(self) -> list[Part]:
+    def white_rows(self, ids: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Rows (k, n_directions, channels) without the albedo; a grey scene has one channel."""
+        return _summed([part.rows(ids) for part in self._parts()])
+
+    def project_white(self, vectors: NDArray[np.float32], ids: NDArray[np.integer]) -> NDArray[np.float32]:
+        """White rows of some vertices times vectors (n_directions, k): (n, k, channels)."""
+        return _summed([part.reordered(ids).project(vectors) for part in self._parts()])
+
+    def _parts(self) -> list[StoredPart]:
         return [self.direct] if self.indirect is None else [self.direct, self.indirect]
 
 
@@ -455,4 +506,9 @@ def _checked(ids: ArrayLike, count: int, what: str) -> Rows:
 
 
 def _summed(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+    """The sum; arrays of one channel stand for three. They are new, and one of them is reused."""
+    if len(parts) == 1:
+        return parts[0]
+    larger, smaller = parts if parts[0].shape[-1] >= parts[1].shape[-1] else parts[::-1]
+    larger += smaller
+    return larger

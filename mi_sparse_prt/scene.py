@@ -201,6 +201,17 @@ class Scene:
         """The number of vertices, which is the number of rows of the matrix."""
         return len(self.positions)
 
+    @cached_property
+    def vertex_areas(self) -> NDArray[np.float32]:
+        """(n_v,) area of the surface around each vertex: a third of its triangles', world units."""
+        areas = np.zeros(self.n_vertices)
+        for mesh in self.meshes:
+            triangles = mesh.triangles + mesh.vertices.start
+            a, b, c = (self.positions[triangles[:, k]].astype(np.float64) for k in range(3))
+            thirds = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+            np.add.at(areas, triangles, thirds[:, None])
+        return areas.astype(np.float32)
+
     @property
     def diffuse(self) -> bool:
         """Whether all BSDFs reflect purely diffusely."""

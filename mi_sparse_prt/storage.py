@@ -19,6 +19,8 @@ import zarr
 from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import BITS
+from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
@@ -33,11 +35,20 @@ from mi_sparse_prt.matrix import (
 )
 
 FORMAT = "mi_sparse_prt light transport matrix"
-VERSION = 4
+VERSION = 5
 _VERTEX_CHUNK = 4096  # rows
 _LIST_CHUNK = 1 << 20  # numbers of a plain list
 # what Zarr, zip and our own assembly raise when a file is not what it should be
-_DAMAGE = (OSError, zipfile.BadZipFile, zlib.error, LookupError, TypeError, ValueError, RuntimeError)
+_DAMAGE = (
+    OSError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    LookupError,
+    TypeError,
+    ValueError,
+    RuntimeError,
+)
 
 
 def save(transport: LightTransport, path: str | Path) -> None:
@@ -146,7 +157,11 @@ def _write(transport: LightTransport, path: str) -> None:
 
 
 def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {"albedo": transport.albedo, "vertex_keys": transport.vertex_keys}
+    arrays: dict[str, NDArray[Any]] = {
+        "albedo": transport.albedo,
+        "areas": transport.areas,
+        "vertex_keys": transport.vertex_keys,
+    }
     direct, indirect = transport.direct, transport.indirect
     if isinstance(direct, Interpolated):
         arrays |= _sparse_arrays("weights_direct", direct.weights)
@@ -161,6 +176,12 @@ def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
         arrays |= {"share_starts": direct.starts, "share_texels": direct.texels, "shares": direct.shares}
     elif isinstance(direct, MeanCosine):
         arrays |= {"mean_cosine": direct.fixed}
+    elif isinstance(direct, Clustered):
+        arrays |= {"cluster_labels": direct.labels, "cluster_coefficients": direct.coefficients}
+        arrays |= {"cluster_means": direct.means, "cluster_bases": direct.bases}
+    elif isinstance(direct, HaarRows):
+        arrays |= {"haar_starts": direct.starts, "haar_places": direct.places}
+        arrays |= {"haar_values": direct.values, "haar_scales": direct.scales}
     if isinstance(indirect, Indirect):
         arrays |= {"indirect": indirect.density, **_sparse_arrays("upsampling", indirect.upsampling)}
     elif isinstance(indirect, Factored):
@@ -190,29 +211,62 @@ def _read(array: Any) -> NDArray[Any]:
 def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
     lighting = CubemapLighting(attributes["resolution"])
     _check_shapes(arrays, lighting)
-    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated
-    if attributes["basis"] == "direction":
-        direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
-        if "weights_direct_data" in arrays:
-            direct = Interpolated(direct, _sparse_matrix("weights_direct", arrays, len(direct.bits)))
-    elif "shares" in arrays:
-        starts, texels, shares = _shares(arrays, lighting.n_directions)
-        direct = FractionalVisibility(
-            arrays["visibility"], starts, texels, shares, arrays["normals"], lighting
-        )
-    else:
-        direct = MeanCosine(arrays["mean_cosine"], lighting)
     return LightTransport(
         lighting=lighting,
         basis=attributes["basis"],
         albedo=arrays["albedo"],
-        direct=direct,
+        areas=arrays["areas"] if attributes["version"] >= 5 else np.ones(len(arrays["albedo"]), np.float32),
+        direct=_direct(attributes["basis"], arrays, lighting),
         indirect=_indirect(arrays, lighting) if attributes["indirect"] else None,
         meshes=tuple(MeshRange(name, slice(a, b)) for name, a, b in attributes["meshes"]),
         vertex_keys=arrays["vertex_keys"],
         scene_hash=attributes["scene_hash"],
         report=attributes["report"],
     )
+
+
+def _direct(
+    basis: str, arrays: dict[str, NDArray[Any]], lighting: CubemapLighting
+) -> Visibility | FractionalVisibility | MeanCosine | Interpolated | Clustered | HaarRows:
+    if "cluster_labels" in arrays:
+        return _clustered(arrays, lighting)
+    if "haar_scales" in arrays:
+        return _haar_rows(arrays, lighting)
+    if basis == "direction":
+        direct = Visibility(arrays["visibility"], arrays["normals"], lighting)
+        if "weights_direct_data" in arrays:
+            return Interpolated(direct, _sparse_matrix("weights_direct", arrays, len(direct.bits)))
+        return direct
+    if "shares" in arrays:
+        starts, texels, shares = _shares(arrays, lighting.n_directions)
+        return FractionalVisibility(arrays["visibility"], starts, texels, shares, arrays["normals"], lighting)
+    return MeanCosine(arrays["mean_cosine"], lighting)
+
+
+def _clustered(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> Clustered:
+    """Labels are looked at: a wrong one would read beyond the clusters."""
+    labels, coefficients, means, bases = (
+        arrays[f"cluster_{name}"] for name in ("labels", "coefficients", "means", "bases")
+    )
+    if coefficients.shape[1] not in (1, 3) or (len(labels) and labels.max() >= len(means)):
+        raise ValueError("clusters and their vertices do not fit together")
+    if bases.shape[:2] != (len(means), coefficients.shape[2]):
+        raise ValueError("basis vectors and coefficients do not fit together")
+    return Clustered(labels, coefficients, means, bases, lighting)
+
+
+def _haar_rows(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> HaarRows:
+    """Lists are looked at: a wrong one would read beyond the lighting's coefficients."""
+    starts, places, values, scales = (
+        arrays[f"haar_{name}"] for name in ("starts", "places", "values", "scales")
+    )
+    if scales.shape[1] not in (1, 3) or places.shape != values.shape or values.dtype != np.float16:
+        raise ValueError("wavelet coefficients and their vertices do not fit together")
+    matrix = scipy.sparse.csr_array((places, places, starts), shape=(scales.size, lighting.n_directions))
+    matrix.check_format(full_check=True)
+    if not matrix.has_canonical_format:
+        raise ValueError("wavelet coefficients are not in order")
+    return HaarRows(starts, places, values, scales, lighting)
 
 
 def _shares(
@@ -252,6 +306,7 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
     n_indirect = len(arrays["indirect"]) if "weights_indirect_indptr" in arrays else n
     expected = {
         "albedo": (n, 3),
+        "areas": (n,),
         "vertex_keys": (n,),
         "normals": (n_direct, 3),
         "visibility": (n_direct, -(-m // BITS)),
@@ -259,14 +314,15 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
         "share_starts": (n + 1,),
         "indirect": (n_indirect, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
         "upsampling_indptr": (m + 1,),
+        "cluster_labels": (n,),
         "weights_direct_indptr": (n + 1,),
         "weights_indirect_indptr": (n + 1,),
     }
     for name, array in arrays.items():
-        if name.startswith("left_"):
+        if name.startswith("left_") or name in ("cluster_coefficients", "haar_scales"):
             expected[name] = (n, *array.shape[1:])
-        elif name.startswith("right_"):
-            expected[name] = (*array.shape[:1], m)
+        elif name.startswith("right_") or name in ("cluster_means", "cluster_bases"):
+            expected[name] = (*array.shape[:-1], m)
     for name, shape in expected.items():
         if name in arrays and arrays[name].shape != shape:
             raise ValueError(f"array {name} has shape {arrays[name].shape} instead of {shape}")

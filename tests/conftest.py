@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, LightTransport, MeanCosine, MeshRange, Visibility
@@ -30,6 +32,10 @@ FORMS = (
     "fixed point and factored grey light",
     "shares",
     "shares and factored light",
+    "wavelets",
+    "grey wavelets",
+    "clusters",
+    "grey clusters",
 )
 
 
@@ -122,6 +128,22 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
             direct = FractionalVisibility(bits, starts, texels, shares, normals, lighting)
     else:
         direct = MeanCosine(rng.integers(0, 1 << 16, (n_vertices, m), dtype=np.uint16), lighting)
+    if "wavelets" in form:
+        channels = 1 if "grey" in form else 3
+        kept = rng.random((n_vertices * channels, m)) < 0.2
+        starts = np.concatenate([[0], np.cumsum(kept.sum(axis=1))])
+        values = rng.normal(size=kept.sum()).astype(np.float16)
+        scales = rng.random((n_vertices, channels), np.float32)
+        direct = HaarRows(starts, np.nonzero(kept)[1].astype(np.uint16), values, scales, lighting)
+    if "clusters" in form:
+        channels = 1 if "grey" in form else 3
+        direct = Clustered(
+            rng.integers(0, 4, n_vertices).astype(np.uint16),
+            rng.normal(size=(n_vertices, channels, 3)).astype(np.float16),
+            rng.normal(size=(4, m)).astype(np.float16),
+            rng.normal(size=(4, 3, m)).astype(np.float16),
+            lighting,
+        )
     indirect = None
     if "indirect" in form:
         coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
@@ -136,6 +158,7 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
         lighting=lighting,
         basis="direction" if form.startswith("bits") else "texel",
         albedo=rng.random((n_vertices, 3), dtype=np.float32),
+        areas=rng.random(n_vertices, dtype=np.float32),
         direct=direct,
         indirect=indirect,
         meshes=(MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices))),

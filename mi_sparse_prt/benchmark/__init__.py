@@ -1,6 +1,7 @@
 """Time, error and memory on the user's own machine, every speed as a ratio to the strongest other form, in one run."""
 
 from mi_sparse_prt.benchmark.choices import measure_choices
+from mi_sparse_prt.benchmark.cpca import measure_cpca
 from mi_sparse_prt.benchmark.methods import measure_methods
 from mi_sparse_prt.benchmark.plans import measure_plans
 from mi_sparse_prt.benchmark.sizes import cost_against_size
@@ -10,6 +11,7 @@ from mi_sparse_prt.benchmark.time_error import time_against_error
 __all__ = [
     "cost_against_size",
     "measure_choices",
+    "measure_cpca",
     "measure_methods",
     "measure_plans",
     "run_benchmark",

@@ -84,7 +84,7 @@ class MethodPictures:
         self.vertex_errors[method] = vertex_errors
         self.relit[method] = render(self.scene, transport, self._light, spp=PIXEL_SAMPLES)
         if self.full is None:
-            background = background_emitter(self._light, transport)
+            background = background_emitter(self._light, transport.lighting)
             integrator = RelitIntegrator(RelitScene(self.scene, self._irradiance, background))
             image = mi.render(self.scene.mitsuba, integrator=integrator, spp=PIXEL_SAMPLES, seed=0)
             self.full = np.array(image)[..., :3]

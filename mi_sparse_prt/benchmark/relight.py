@@ -69,6 +69,7 @@ def _transport(
         lighting=lighting,
         basis="direction",
         albedo=scene.albedo,
+        areas=scene.vertex_areas,
         direct=Visibility(bits, scene.normals, lighting),
         indirect=indirect,
         meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),

@@ -18,6 +18,7 @@ from mi_sparse_prt.cli.running import check_folder, running
 from mi_sparse_prt.cli.tables import (
     benchmark_tables,
     choices_tables,
+    cpca_tables,
     matrix_tables,
     methods_tables,
     plan_tables,
@@ -466,11 +467,15 @@ def benchmark(
             "--sizes", help="Measure cost at 10,000 to 500,000 vertices and resolutions of 8 to 64 instead."
         ),
     ] = False,
+    cpca: Annotated[
+        bool,
+        typer.Option("--cpca", help="Compare clustered PCA in two passes with the standard one instead."),
+    ] = False,
     figures: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Draw what --method, --choices, --time-error or --sizes measures: PNG files there.",
+            help="Draw what --method, --choices, --time-error, --sizes or --cpca measures: PNG files there.",
             show_default=False,
         ),
     ] = None,
@@ -487,6 +492,7 @@ def benchmark(
     With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
     With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
     With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
+    With --cpca --figures FOLDER: compression, the paper's Figure 11.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -498,6 +504,7 @@ def benchmark(
         "--time-error": time_error,
         "--plans": plans,
         "--sizes": sizes,
+        "--cpca": cpca,
     }
     which = [name for name, given in asked.items() if given]
     if len(which) > 1:
@@ -525,6 +532,7 @@ def benchmark(
                     "--choices": (benchmarks.measure_choices, choices_tables),
                     "--time-error": (benchmarks.time_against_error, time_error_tables),
                     "--plans": (benchmarks.measure_plans, plans_tables),
+                    "--cpca": (benchmarks.measure_cpca, cpca_tables),
                 }
                 measure, show = kinds["".join(which)]
                 command.report = measure(*case, progress=progress, **drawn)

@@ -300,6 +300,42 @@ def sizes_tables(report: dict[str, Any]) -> list[Table]:
     return [*tables, *([_sentences("Skipped", report["skipped"])] if report["skipped"] else [])]
 
 
+def cpca_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_cpca`` found."""
+    table = _table(
+        "Clustered PCA", "mesh", "clusters", "standard", "two passes", "faster", "error", "error, two passes"
+    )
+    for name, found in report["meshes"].items():
+        table.add_row(
+            f"{name}, {found['vertices']:,} vertices",
+            f"{found['clusters']} x {found['bases']}",
+            _duration(found["standard"]["seconds"]),
+            _duration(found["two_pass"]["seconds"]),
+            f"{found['faster']:.1f} x",
+            _share(found["standard"]["error"]),
+            f"{_share(found['two_pass']['error'])} ({found['error_increase']:+.1%})",
+        )
+    total = report["total"]
+    table.add_section()
+    table.add_row(
+        "all",
+        "",
+        _duration(total["standard"]),
+        _duration(total["two_pass"]),
+        f"{total['faster']:.1f} x",
+        "",
+        "",
+    )
+    whole = _table("Compressed matrix", "", "")
+    compressed = report["compressed"]
+    whole.add_row("size", f"{_bytes(compressed['nbytes'])}, 1/{compressed['ratio']:.1f} of float32")
+    whole.add_row("time", _duration(compressed["seconds"]["total"]))
+    whole.add_row("relative L2 of the matrix", _share(compressed["error"]["total"]))
+    if report["image"] is not None:
+        whole.add_row("of a relit image", _share(report["image"]))
+    return [table, whole]
+
+
 def _plan(plan: dict[str, Any]) -> str:
     """A plan in a few words."""
     parameters = " ".join(

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.measurement.factor_tables import outgoing_tables
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.glossy_gather import looked_up
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart
+
+Corner = tuple[
+    Any, Any
+]  # of the triangles that rays meet: vertices (UInt32), and their barycentric weights (Float)
 
 
 class RelitScene:
@@ -46,27 +56,92 @@ class RelitScene:
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
         valid = active & si.is_valid()
+        front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
+        value = dr.select(front, self._shaded(si, self._hit_corners(hit, valid), valid), 0)
+        if self._background is not None:
+            value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
+        return value, valid
+
+    def _hit_corners(self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask) -> list[Corner]:
         first = dr.gather(mi.UInt32, self._first_triangle, dr.reinterpret_array(mi.UInt32, hit.shape), valid)
         triangle = first + hit.prim_index
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
+        return list(zip(vertices, (1 - u - v, u, v), strict=True))
+
+    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+        """Radiance that leaves the fronts of surfaces."""
         irradiance, albedo = (
-            sum(
-                w * dr.gather(mi.Color3f, values, i, valid)
-                for w, i in zip((1 - u - v, u, v), vertices, strict=True)
-            )
-            for values in (self._irradiance, self._albedo)
+            interpolated(values, corners, valid) for values in (self._irradiance, self._albedo)
         )
         bsdf = si.bsdf()
         diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(
             bsdf.flags(), mi.BSDFFlags.Delta
         )
         textured = bsdf.eval_diffuse_reflectance(si, valid)
-        front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
-        value = dr.select(front, irradiance * dr.select(diffuse, textured, albedo), 0)
-        if self._background is not None:
-            value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
-        return value, valid
+        return irradiance * dr.select(diffuse, textured, albedo)
+
+
+def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+    """Values of vertices at points of triangles."""
+    return sum((w * dr.gather(mi.Color3f, values, i, valid) for i, w in corners), mi.Color3f(0))
+
+
+class GlossyRelitScene(RelitScene):
+    """A scene with glossy surfaces, relit: coefficients of vertices are interpolated, BRDFs looked up at each hit.
+
+    Each corner of a triangle has its own tangent, turned into the plane of the hit's normal: coefficients are never
+    mixed across seams.
+
+    Parameters
+    ----------
+    scene : Scene
+    transport : GlossyTransport
+    environment : Environment or (n_directions, 3) float
+    background : mi.Emitter or None
+
+    Raises
+    ------
+    PrtError
+        If the matrix belongs to another scene.
+    """
+
+    def __init__(
+        self, scene: Scene, transport: GlossyTransport, environment: Any, background: mi.Emitter | None
+    ) -> None:
+        if transport.scene_hash != scene.hash:
+            raise PrtError(f"this matrix belongs to another scene than {scene.path or 'the one given'}")
+        found = transport.coefficients(environment)
+        super().__init__(scene, found.white, background)
+        self._diffuse = mi.Color3f(np.ascontiguousarray(transport.albedo.T))
+        self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
+        self._tangents = mi.Vector3f(np.ascontiguousarray(transport.tangents.T))
+        self._material = mi.UInt32(np.maximum(transport.material, 0).astype(np.uint32))
+        self._glossy = mi.Bool(transport.material >= 0)
+        tables = outgoing_tables(transport.factors)
+        self._size = tables.shape[1]
+        self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
+
+    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+        glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
+        total = dr.select(
+            glossy,
+            interpolated(self._irradiance, corners, glossy) * interpolated(self._diffuse, corners, glossy),
+            super()._shaded(si, corners, valid),
+        )
+        material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
+        towards = si.to_world(si.wi)
+        for vertex, weight in corners:
+            tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
+            s = dr.normalize(tangent - si.sh_frame.n * dr.dot(si.sh_frame.n, tangent))
+            local = mi.Frame3f(s, dr.cross(si.sh_frame.n, s), si.sh_frame.n).to_local(towards)
+            lobes = [
+                looked_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables
+            ]
+            for k, values in enumerate(self._terms):
+                coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
+                total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)
+        return total
 
 
 class RelitIntegrator(mi.SamplingIntegrator):
@@ -90,7 +165,7 @@ class RelitIntegrator(mi.SamplingIntegrator):
 
 def render(
     scene: Scene,
-    transport: LightTransport,
+    transport: LightTransport | GlossyTransport,
     environment: Environment | mi.Emitter | ArrayLike,
     sensor: int | mi.Sensor = 0,
     spp: int = 64,
@@ -103,7 +178,7 @@ def render(
     ----------
     scene : Scene
         The scene of the matrix.
-    transport : LightTransport
+    transport : LightTransport or GlossyTransport
     environment : Environment, emitter or (n_directions, 3) float
         The light; also the background.
     sensor : int or mi.Sensor
@@ -130,8 +205,11 @@ def render(
                 f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
             )
         sensor = sensors[sensor]
-    irradiance = transport.for_scene(scene).irradiance(environment)
-    relit = RelitScene(scene, irradiance, background_emitter(environment, transport))
+    background = background_emitter(environment, transport.lighting)
+    if isinstance(transport, GlossyTransport):
+        relit: RelitScene = GlossyRelitScene(scene, transport, environment, background)
+    else:
+        relit = RelitScene(scene, transport.for_scene(scene).irradiance(environment), background)
     integrator = RelitIntegrator(relit)
     passes = []
     with tqdm(total=spp, desc="render", unit=" spp", disable=not progress) as bar:
@@ -146,7 +224,7 @@ def render(
 
 
 def background_emitter(
-    environment: Environment | mi.Emitter | ArrayLike, transport: LightTransport
+    environment: Environment | mi.Emitter | ArrayLike, lighting: CubemapLighting
 ) -> mi.Emitter:
     """An environment as a Mitsuba emitter: an image as ``envmap``, texel values as ``cubemap``."""
     if isinstance(environment, mi.Emitter):
@@ -161,8 +239,7 @@ def background_emitter(
                 "to_world": mi.ScalarTransform4f(to_world),
             }
         )
-    texels = transport.lighting.project(environment)
-    n = transport.lighting.resolution
+    texels, n = lighting.project(environment), lighting.resolution
     return mi.load_dict({"type": "cubemap", "data": mi.TensorXf(texels.reshape(6, n, n, 3)), "resolution": n})
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.bits import Bits, above_horizon, bits_at, unpack
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.matrix import MeanCosine, Part, Visibility
 from mi_sparse_prt.scene import Scene
 
@@ -52,11 +53,11 @@ class Contacts:
             fixed = direct.fixed.copy()
             fixed[self.vertices] *= unpack(self.open, fixed.shape[1])
             return replace(direct, fixed=fixed)
-        if not isinstance(direct, Visibility | FractionalVisibility):
+        if not isinstance(direct, Visibility | FractionalVisibility | FactoredVisibility):
             return _Lit(direct, self)
         bits = direct.bits.copy()
         bits[self.vertices] &= self.open
-        if isinstance(direct, Visibility):
+        if not isinstance(direct, FractionalVisibility):
             return replace(direct, bits=bits)
         return replace(direct, bits=bits, shares=self._lit_shares(direct))
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.matrix import MeanCosine, Part, Visibility
 from mi_sparse_prt.transport.direct import FIXED_POINT
 
@@ -36,6 +37,8 @@ class DirectColumns:
         self._direct, self._lighting, self._vertices = direct, lighting, vertices
         if vertices is not None and isinstance(direct, Visibility | MeanCosine):
             self._direct, self._vertices = direct.reordered(vertices), None
+        elif vertices is not None and isinstance(direct, FactoredVisibility):
+            self._direct, self._vertices = direct.with_rows(vertices)
         self._buffer: Floats = np.empty(0, np.float32)
         self.n_texels = lighting.n_directions
 
@@ -52,7 +55,11 @@ class DirectColumns:
             result = self._room(len(direct.fixed), len(texels))
             _convert(direct.fixed, np.asarray(texels, np.int64), power / np.float32(FIXED_POINT), result)
             return result
-        columns = direct.columns(texels)[..., 0]
+        if isinstance(direct, FactoredVisibility):
+            dull = DirectColumns(direct.white, self._lighting).at(texels)
+            columns = np.concatenate([dull, direct.term_columns(texels)])
+        else:
+            columns = direct.columns(texels)[..., 0]
         return columns if self._vertices is None else columns[self._vertices]
 
     def combined(self, few: int, rng: np.random.Generator) -> Floats:
@@ -63,7 +70,14 @@ class DirectColumns:
         width = min(BITS, self.n_texels)
         words = rng.permutation(self.n_texels // width)[:few]
         signs = rng.choice(np.array([-1, 1], np.float32), (len(words), width))
-        texels = words[:, None] * width + np.arange(width)
+        if isinstance(self._direct, FactoredVisibility):
+            dull = DirectColumns(self._direct.white, self._lighting)._added(words, signs)
+            return np.concatenate([dull, self._direct.combined(words, signs)])
+        return self._added(words, signs)
+
+    def _added(self, words: NDArray[np.int64], signs: Floats) -> Floats:
+        """Sums of columns at the same place in some words, with signs (words, bits)."""
+        texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
         if isinstance(self._direct, Visibility):
             power = self._lighting.solid_angles[texels] / np.float32(np.pi)
             beams = np.moveaxis(self._lighting.directions[texels], 2, 1) * power[:, None]  # [word, xyz, bit]

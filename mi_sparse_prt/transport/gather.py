@@ -25,7 +25,7 @@ from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.matrix import Factored, Part
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.contacts import contacts
+from mi_sparse_prt.transport.contacts import Contacts, contacts
 from mi_sparse_prt.transport.direct_columns import DirectColumns
 from mi_sparse_prt.transport.first_bounce import LowRank, all_but_least, first_bounce
 from mi_sparse_prt.transport.gather_matrix import gather_matrix
@@ -56,62 +56,41 @@ class Gathered(Factored):
     bounces: int
 
 
-class GatherTransport:
-    """Indirect light at the vertices of a diffuse scene.
+class FiniteElements:
+    """Interreflections between vertices, or whatever else rows of light stand for.
 
     Parameters
     ----------
-    scene : Scene
+    matrix : (n_nodes, n) sparse float32
+        G.
+    albedo : (channels, n) float32
+    keys : (n,) uint64
+        Random numbers are made of them.
+    nodes : Nodes
+        Those that gather light, others interpolate theirs.
+    contacts : Contacts
+        Vertices whose light is in part none for the triangles around them.
     lighting : CubemapLighting
-    points : Points
-        Of all vertices (``vertex_points``).
-    rays_per_vertex : int
-        A power of two: Sobol points, scrambled for each vertex by its key.
     max_depth : int
         As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
         nothing are left out.
     seed : int
-    nodes : Nodes, optional
-        The vertices that gather light, others interpolate theirs; all if not given.
-
-    Attributes
-    ----------
-    nodes : Nodes
-    contacts : Contacts
-        Vertices whose light is in part none for the triangles around them.
-    matrix : (n_nodes, n_v) sparse float32
-        G. Rows sum to the share of the hemisphere, by cosine, in which fronts of surfaces are seen.
-    channels : {1, 3}
-        1 in a grey scene.
-    rays : int
-        That were traced.
-
-    Raises
-    ------
-    PrtError
-        If a surface is not diffuse, or if vertices often see the backs of surfaces that reflect on both sides: light
-        is known at their fronts only.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        matrix: scipy.sparse.csr_array,
+        albedo: Floats,
+        keys: NDArray[np.uint64],
+        nodes: Nodes,
+        contacts: Contacts,
         lighting: CubemapLighting,
-        points: Points,
-        rays_per_vertex: int = 256,
-        max_depth: int = 5,
-        seed: int = 0,
-        nodes: Nodes | None = None,
+        max_depth: int,
+        seed: int,
     ) -> None:
-        _check_diffuse(scene)
-        self.lighting, self.max_depth, self.seed = lighting, max_depth, seed
-        self.channels = 1 if scene.grey else 3
-        self._albedo = np.ascontiguousarray(scene.albedo.T[: self.channels])  # [channel, vertex]
-        self._keys = points.keys
-        self.nodes = nodes or Nodes(np.arange(len(points)), None)
-        self.rays = len(self.nodes) * rays_per_vertex
-        self.contacts = contacts(scene, lighting)
-        self.matrix = gather_matrix(scene, points, rays_per_vertex, seed, self.nodes.ids)
+        self.matrix, self._albedo, self._keys, self.nodes = matrix, albedo, keys, nodes
+        self.contacts, self.lighting, self.max_depth, self.seed = contacts, lighting, max_depth, seed
+        self.channels = len(albedo)
 
     def apply(self, columns: Floats) -> Floats:
         """Indirect light under a few lights, without approximation.
@@ -271,6 +250,68 @@ class GatherTransport:
         """One bounce: G rho W x for arrays x (n_nodes, any), one per channel."""
         pairs = zip(self._albedo, light, strict=True)
         return [gathered(self.matrix, rho[None], self.nodes.spread(x))[0] for rho, x in pairs]
+
+
+class GatherTransport(FiniteElements):
+    """Indirect light at the vertices of a diffuse scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    lighting : CubemapLighting
+    points : Points
+        Of all vertices (``vertex_points``).
+    rays_per_vertex : int
+        A power of two: Sobol points, scrambled for each vertex by its key.
+    max_depth : int
+        As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
+        nothing are left out.
+    seed : int
+    nodes : Nodes, optional
+        The vertices that gather light, others interpolate theirs; all if not given.
+
+    Attributes
+    ----------
+    nodes : Nodes
+    contacts : Contacts
+        Vertices whose light is in part none for the triangles around them.
+    matrix : (n_nodes, n_v) sparse float32
+        G. Rows sum to the share of the hemisphere, by cosine, in which fronts of surfaces are seen.
+    channels : {1, 3}
+        1 in a grey scene.
+    rays : int
+        That were traced.
+
+    Raises
+    ------
+    PrtError
+        If a surface is not diffuse, or if vertices often see the backs of surfaces that reflect on both sides: light
+        is known at their fronts only.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        lighting: CubemapLighting,
+        points: Points,
+        rays_per_vertex: int = 256,
+        max_depth: int = 5,
+        seed: int = 0,
+        nodes: Nodes | None = None,
+    ) -> None:
+        _check_diffuse(scene)
+        nodes = nodes or Nodes(np.arange(len(points)), None)
+        super().__init__(
+            gather_matrix(scene, points, rays_per_vertex, seed, nodes.ids),
+            np.ascontiguousarray(scene.albedo.T[: 1 if scene.grey else 3]),
+            points.keys,
+            nodes,
+            contacts(scene, lighting),
+            lighting,
+            max_depth,
+            seed,
+        )
+        self.rays = len(nodes) * rays_per_vertex
 
 
 def _energies(x: Floats) -> NDArray[np.float64]:

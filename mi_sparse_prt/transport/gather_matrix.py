@@ -53,7 +53,7 @@ def gather_matrix(
     """
     if rays_per_vertex < 1 or rays_per_vertex & (rays_per_vertex - 1):
         raise PrtError(f"rays_per_vertex {rays_per_vertex} is not a power of two; use 64, 128, 256, ...")
-    surfaces, arrays, samples = _Surfaces(scene), PointArrays(points), _sobol(rays_per_vertex)
+    surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
     starting = np.arange(len(points)) if nodes is None else nodes
     size = max(1, LANES // rays_per_vertex)
     blocks, met, behind = [], 0, 0
@@ -70,7 +70,7 @@ def gather_matrix(
     return scipy.sparse.csr_array(entries, shape=(len(starting), len(points)))
 
 
-class _Surfaces:
+class Surfaces:
     """The triangles of a scene on the device, by the numbers of all vertices."""
 
     def __init__(self, scene: Scene) -> None:
@@ -93,20 +93,12 @@ class _Surfaces:
         self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
     ) -> NDArray[np.int32]:
         """A vertex, NOTHING or BEHIND for every sample of each point; samples side by side."""
-        rays = len(samples[0])
-        lane = dr.arange(mi.UInt32, len(ids) * rays)
-        row = lane // rays
-        point = dr.gather(mi.UInt32, ids, row)
-        rng = random_generator(points.key(point), mi.UInt32(0), mi.UInt32(0), seed)
-        # bits flipped alike for all samples of a point (Owen's digital shift): they stay stratified
-        x, y, z = (
-            mi.Float((dr.gather(mi.UInt32, column, lane - row * rays) ^ rng.next_uint32()) >> 8) * 2**-24
-            for column in samples
-        )
-        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
-        direction = mi.Frame3f(points.normal(point)).to_world(local)
-        hit = self._scene.ray_intersect_preliminary(start_ray(points, point, direction))
-        return mi.Int32(self._vertex(hit, direction, z)).numpy()
+        ray, _, u = cosine_rays(points, ids, samples, seed)
+        return mi.Int32(self.traced(ray, u)).numpy()
+
+    def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
+        """A vertex, NOTHING or BEHIND for every ray; u in [0, 1) chooses among the corners of a triangle."""
+        return self._vertex(self._scene.ray_intersect_preliminary(ray), ray.d, u)
 
     def _vertex(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
         """The corner of each hit triangle that u in [0, 1) selects."""
@@ -136,7 +128,26 @@ class _Surfaces:
             )
 
 
-def _sobol(n: int) -> list[mi.UInt32]:
+def cosine_rays(
+    points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
+) -> tuple[mi.Ray3f, mi.UInt32, mi.Float]:
+    """Cosine-distributed rays from points, samples side by side; each one's point, and a number in [0, 1) for it."""
+    rays = len(samples[0])
+    lane = dr.arange(mi.UInt32, len(ids) * rays)
+    row = lane // rays
+    point = dr.gather(mi.UInt32, ids, row)
+    rng = random_generator(points.key(point), mi.UInt32(0), mi.UInt32(0), seed)
+    # bits flipped alike for all samples of a point (Owen's digital shift): they stay stratified
+    x, y, z = (
+        mi.Float((dr.gather(mi.UInt32, column, lane - row * rays) ^ rng.next_uint32()) >> 8) * 2**-24
+        for column in samples
+    )
+    local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
+    direction = mi.Frame3f(points.normal(point)).to_world(local)
+    return start_ray(points, point, direction), point, z
+
+
+def sobol(n: int) -> list[mi.UInt32]:
     """Three columns of n Sobol points as 32-bit fractions, neighbours on the square side by side."""
     fractions = qmc.Sobol(3, scramble=False, bits=32).random(n)
     points = (fractions * 2.0**32).astype(np.uint64).astype(np.uint32)

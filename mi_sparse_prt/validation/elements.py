@@ -7,6 +7,8 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import bits_at
+from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility
 from mi_sparse_prt.transport.direct import FIXED_POINT
@@ -15,8 +17,10 @@ BLOCK = (
     1 << 15
 )  # elements at a time: an interpolated one has up to 40 dense ones, those four coarse ones each
 
+EXPANDED = 512  # compressed rows at a time
+
 Ids = NDArray[np.integer]
-AnyPart = Visibility | FractionalVisibility | MeanCosine | Indirect | Interpolated | Factored
+AnyPart = Visibility | FractionalVisibility | MeanCosine | Indirect | Interpolated | Factored | HaarRows | Clustered
 
 
 def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
@@ -40,6 +44,9 @@ def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:
     if isinstance(part, MeanCosine):
         weights = part.lighting.solid_angles[texels] / np.float32(np.pi * FIXED_POINT)
         return (part.fixed[ids, texels] * weights)[:, None]
+    if isinstance(part, HaarRows | Clustered):
+        few = [slice(a, a + EXPANDED) for a in range(0, max(len(ids), 1), EXPANDED)]
+        return np.concatenate([part.rows(ids[b])[np.arange(len(ids[b])), texels[b]] for b in few])
     blocks = [slice(a, a + BLOCK) for a in range(0, max(len(ids), 1), BLOCK)]
     if isinstance(part, Indirect):
         return np.concatenate([_interreflected(part, ids[b], texels[b]) for b in blocks])

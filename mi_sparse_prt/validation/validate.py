@@ -257,7 +257,7 @@ def _image_error(
 ) -> tuple[dict[str, float], Figure]:
     """A relit image against ``path`` under the same cubemap, in two halves, and what interpolation alone costs."""
     lighting = transport.lighting.project(environment)
-    background = background_emitter(lighting, transport)
+    background = background_emitter(lighting, transport.lighting)
     max_depth = transport.report["parameters"]["max_depth"]
     sensor = scene.mitsuba.sensors()[0]
     seeds = (2 * seed + 10, 2 * seed + 11)

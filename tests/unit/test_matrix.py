@@ -9,6 +9,9 @@ from conftest import FORMS, build, diffuse, made_up, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.haar_rows import HaarRows
+from mi_sparse_prt.emission.haar import inverse_haar
 from mi_sparse_prt.fractional_visibility import FractionalVisibility, _means
 from mi_sparse_prt.matrix import Factored, LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -31,6 +34,10 @@ def slow(transport: LightTransport) -> NDArray[np.float64]:
                 white = np.full(3, visible * max(0.0, cosine) * solid_angle / np.pi)
             elif isinstance(transport.direct, FractionalVisibility):
                 white = np.full(3, share(transport.direct, i, j) * solid_angle / np.pi)
+            elif isinstance(transport.direct, Clustered):
+                white = clustered(transport.direct, i)[:, j] * np.sqrt(solid_angle)
+            elif isinstance(transport.direct, HaarRows):
+                white = wavelets(transport.direct, i)[:, j] * np.sqrt(solid_angle)
             else:
                 white = np.full(3, transport.direct.fixed[i, j] / 65535 * solid_angle / np.pi)
             if isinstance(transport.indirect, Factored):
@@ -53,6 +60,25 @@ def share(direct: FractionalVisibility, i: int, j: int) -> float:
     if low >= 0:
         return seen * (low + high) / 2
     return seen * max(high, 0) ** 2 / (2 * (high - low))
+
+
+def clustered(direct: Clustered, i: int) -> NDArray[np.float64]:
+    """Row i (3, n_directions) as a function on the sphere."""
+    c = direct.labels[i]
+    along = direct.coefficients[i].astype(np.float64) @ direct.bases[c].astype(np.float64)
+    return np.broadcast_to(along + direct.means[c], (3, direct.lighting.n_directions))
+
+
+def wavelets(direct: HaarRows, i: int) -> NDArray[np.float64]:
+    """Row i (3, n_directions) as a function on the sphere."""
+    channels = direct.scales.shape[1]
+    coefficients = np.zeros((3, direct.lighting.n_directions))
+    for colour in range(3):
+        k = i * channels + colour % channels
+        for e in range(direct.starts[k], direct.starts[k + 1]):
+            value = float(direct.values[e]) * float(direct.scales[i, colour % channels])
+            coefficients[colour, direct.places[e]] = value
+    return inverse_haar(coefficients).astype(np.float64)
 
 
 @pytest.fixture(scope="module", params=FORMS)

@@ -1,0 +1,1 @@
+"""The matrix made small for relighting: clustered principal components, wavelets."""

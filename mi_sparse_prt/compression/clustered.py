@@ -1,0 +1,278 @@
+"""Clustered PCA of a light transport matrix, of its factors: the matrix itself is never formed ([HR10] 6).
+
+Rows of white transport t_j are taken as functions on the sphere: t_j / sqrt(d_omega_j) has their L2 norm, as T has the
+solid angle in it. Rows weigh by their vertices' area.
+
+What makes it quick: inner products of rows are those of their coordinates in the space that a sample of rows spans, a
+few hundred numbers in place of thousands; for T = A D + S these are A times those of D, plus those of S. A fifth of the
+rows finds the clusters, the others join them. Only the bases at the end are made of the rows themselves.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from mi_sparse_prt.compression.cpca import Clusters, affine_space, random_mixtures, two_pass_cpca
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.hashing import mix
+from mi_sparse_prt.matrix import LightTransport, MeshRange
+
+COORDINATES = 192  # at most
+SAMPLE = 1536  # rows that span their space
+DENSE = 5  # one row in so many finds the clusters
+FITTED = 4096  # rows of a cluster that its basis is made of, at most
+FINAL_PASSES = 2
+WORKERS = 2  # threads that fit clusters while another expands the rows of the next
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.int64]
+
+
+class Rows(Protocol):
+    """White transport by rows; ``LightTransport`` and ``GlossyTransport`` have it."""
+
+    @property
+    def lighting(self) -> CubemapLighting: ...
+
+    def white_rows(self, ids: NDArray[np.integer]) -> Floats:
+        """(k, n_directions, channels)."""
+
+    def project_white(self, vectors: Floats, ids: NDArray[np.integer]) -> Floats:
+        """Some rows times vectors (n_directions, r): (k, r, channels)."""
+
+
+@dataclass(frozen=True)
+class Items:
+    """Vertices of one mesh, whose rows share a cluster ([Leh07] 3.3).
+
+    Attributes
+    ----------
+    rows : (n, r) int64
+        Numbers of each vertex's rows: one, or more for the terms of a BRDF.
+    areas : (n,) float32
+    shades : (n, r * channels) float32
+        What the rows are multiplied with in T, squared, all three channels together.
+    keys : (n,) uint64
+        Of the vertices.
+    """
+
+    rows: Indices
+    areas: Floats
+    shades: Floats
+    keys: NDArray[np.uint64]
+
+
+class SphereRows:
+    """White transport of some vertices, rows scaled to the L2 norm on the sphere.
+
+    Parameters
+    ----------
+    transport : Rows
+    items : Items
+    """
+
+    def __init__(self, transport: Rows, items: Items) -> None:
+        self._transport, self.items = transport, items
+        self.scale = np.sqrt(transport.lighting.solid_angles).astype(np.float32)
+        self.weights = items.areas if items.areas.any() else np.ones_like(items.areas)
+        self._order = np.argsort(mix(items.keys), kind="stable")
+
+    def __len__(self) -> int:
+        return len(self.items.rows)
+
+    def sample(self, count: int) -> Indices:
+        """Some vertices, chosen by their keys: the same ones in any order of vertices."""
+        return np.sort(self._order[:count])
+
+    def rows(self, ids: Indices) -> Floats:
+        """(k, r * channels, n_directions)."""
+        white = self._transport.white_rows(self.items.rows[ids].ravel())  # [row, direction, channel]
+        result = np.ascontiguousarray(np.moveaxis(white, 2, 1)).reshape(len(ids), -1, white.shape[1])
+        result /= self.scale
+        return result
+
+    def span(self) -> Floats:
+        """Orthonormal vectors (at most COORDINATES, n_directions) that a sample of rows nearly lies in."""
+        ids = self.sample(SAMPLE)
+        some = self.rows(ids).reshape(-1, len(self.scale))
+        weights = np.repeat(self.weights[ids], len(some) // len(ids))
+        random = random_mixtures(len(some), COORDINATES)
+        found: Floats = affine_space(some, weights, COORDINATES, some[:0], False, 1, random)[1]
+        return found if len(found) else np.eye(1, some.shape[1], dtype=np.float32)  # all is black
+
+    def coordinates(self, span: Floats) -> Floats:
+        """Of all vertices, (n, r * channels, q) for q vectors."""
+        vectors = span.T / self.scale[:, None]
+        found = self._transport.project_white(vectors, self.items.rows.ravel())  # [row, vector, channel]
+        found = np.ascontiguousarray(np.moveaxis(found, 2, 1))
+        return found.reshape(len(self), self.items.shades.shape[1], len(span))
+
+
+def mesh_rows(transport: LightTransport, mesh: MeshRange) -> SphereRows:
+    """The rows of one mesh."""
+    own = mesh.vertices
+    shades = np.square(transport.albedo[own])
+    if transport.white_rows(np.arange(own.start, own.start + 1)).shape[2] == 1:  # it stands for three
+        shades = shades.sum(axis=1, keepdims=True)
+    ids = np.arange(own.start, own.stop)[:, None]
+    return SphereRows(transport, Items(ids, transport.areas[own], shades, transport.vertex_keys[own]))
+
+
+@dataclass(frozen=True)
+class MeshClusters:
+    """One mesh, compressed, and what that left out.
+
+    Attributes
+    ----------
+    labels : (n,) int64
+    coefficients : (n, r * channels, b) float16
+    means : (k, n_directions) float16
+    bases : (k, b, n_directions) float16
+    left : (b + 1,) float64
+        Squared error on the sphere, weighted by area, with 0 to b vectors.
+    energy : float
+        Squared norm of the rows, weighted so.
+    squares, norms : float
+        Squared error and squared norm of T's rows: not weighted, albedo and solid angles included.
+    """
+
+    labels: Indices
+    coefficients: NDArray[np.float16]
+    means: NDArray[np.float16]
+    bases: NDArray[np.float16]
+    left: NDArray[np.float64]
+    energy: float
+    squares: float
+    norms: float
+
+    def first(self, count: int) -> MeshClusters:
+        """With fewer basis vectors; ``squares`` are those of all."""
+        return replace(
+            self,
+            coefficients=self.coefficients[:, :, :count],
+            bases=self.bases[:, :count],
+            left=self.left[: count + 1],
+        )
+
+
+def clustered_mesh(
+    rows: SphereRows, clusters: int, bases: int, centred: bool = True, seed: int = 0
+) -> MeshClusters:
+    """Clustered PCA of one mesh in two passes.
+
+    Parameters
+    ----------
+    rows : SphereRows
+    clusters, bases : int
+        At most.
+    centred : bool
+        Whether a cluster's space passes through its mean, or through the origin.
+    seed : int
+    """
+    span = rows.span()
+    coordinates = rows.coordinates(span)
+    dense = rows.sample(max(-(-len(rows) // DENSE), min(len(rows), clusters * bases)))
+    found = two_pass_cpca(coordinates, rows.weights, dense, clusters, bases, centred, seed)
+    return finished(rows, found, span, centred)
+
+
+def finished(rows: SphereRows, found: Clusters, span: Floats, centred: bool = True) -> MeshClusters:
+    """Spaces made of the rows themselves, coefficients of all rows, and their errors; all rounded to 16 bits.
+
+    Parameters
+    ----------
+    rows : SphereRows
+    found : Clusters
+        In coordinates.
+    span : (q, n_directions) float32
+        What these are coordinates of.
+    centred : bool
+    """
+    k, b, m = *found.bases.shape[:2], span.shape[1]
+    members = [np.flatnonzero(found.labels == c) for c in range(k)]
+    order = np.argsort([-len(some) for some in members], kind="stable")
+    means, vectors = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
+    channels = rows.items.shades.shape[1]
+    coefficients = np.zeros((len(rows), channels, b), np.float16)
+    left, sums, squared_scale = np.zeros(b + 1), np.zeros(3), np.square(rows.scale)
+
+    one, random = np.ones((FITTED, channels, 1), np.float32), random_mixtures(FITTED * channels, 0)
+
+    def fit(c: int, first: Floats, ids: Indices) -> None:
+        weights = np.repeat(rows.weights[ids[: len(first)]], channels)
+        mean, basis = affine_space(
+            first.reshape(-1, m), weights, b, found.bases[c] @ span, centred, FINAL_PASSES, random
+        )
+        means[c], vectors[c, : len(basis)] = mean, basis
+
+    def project(c: int, some: Floats, ids: Indices) -> None:
+        mean, basis = means[c].astype(np.float32), vectors[c].astype(np.float32)
+        shades, weights = rows.items.shades[ids], rows.weights[ids].astype(np.float64)
+        squares, norms = _squares(some, squared_scale)
+        coefficients[ids] = some @ basis.T - mean @ basis.T
+        along = coefficients[ids].astype(np.float32)
+        some -= np.concatenate([along, one[: len(ids)]], axis=2) @ np.concatenate([basis, mean[None]])
+        errors, left_out = _squares(some, squared_scale)
+        kept = np.square(along, dtype=np.float64).sum(axis=1)  # [vertex, vector]
+        by_count = errors.sum(axis=1)[:, None] + np.cumsum(kept[:, ::-1], axis=1)[:, ::-1]
+        left[:-1] += weights @ by_count
+        left[-1] += weights @ errors.sum(axis=1)
+        sums[0] += weights @ squares.sum(axis=1)
+        sums[1] += (shades * left_out).sum()
+        sums[2] += (shades * norms).sum()
+
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(WORKERS) as pool:
+        pending: deque[Future[None]] = deque()
+        for c, ids, some, is_first in _blocks(rows, members, order):
+            while len(pending) > WORKERS:
+                pending.popleft().result()
+
+            def work(c: int = c, ids: Indices = ids, some: Floats = some, is_first: bool = is_first) -> None:
+                if is_first:
+                    fit(c, some, ids)
+                project(c, some, ids)
+
+            pending.append(pool.submit(work))
+        for future in pending:
+            future.result()
+    return MeshClusters(
+        found.labels, coefficients, means, vectors, np.maximum(left, 0), sums[0], sums[1], sums[2]
+    )
+
+
+@numba.njit(fastmath=True, nogil=True, cache=True)
+def _squares(rows: Floats, weights: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums (n, channels) of squares along rows (n, channels, m), and of squares times weights (m,)."""
+    n, channels, m = rows.shape
+    plain, weighted = np.empty((n, channels)), np.empty((n, channels))
+    for i in range(n):
+        for c in range(channels):
+            a, b = np.float32(0), np.float32(0)
+            for j in range(m):
+                square = rows[i, c, j] * rows[i, c, j]
+                a += square
+                b += square * weights[j]
+            plain[i, c], weighted[i, c] = a, b
+    return plain, weighted
+
+
+def _blocks(
+    rows: SphereRows, members: list[Indices], order: Indices
+) -> Iterator[tuple[int, Indices, Floats, bool]]:
+    """Clusters, the largest first, in blocks of rows; the first block of each is a fair sample."""
+    for c in order:
+        ids = members[c]
+        if len(ids) > FITTED:
+            ids = np.random.default_rng(0).permutation(ids)
+        for a in range(0, len(ids), FITTED):
+            some = ids[a : a + FITTED]
+            yield int(c), some, rows.rows(some), a == 0

@@ -1,0 +1,386 @@
+"""Clustered principal component analysis: rows near a few affine spaces of few dimensions ([SHHS03], [HR10] 6).
+
+Plain arrays. An item (a vertex) has one row or several (colour channels, terms of a BRDF), all in one cluster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+ITERATIONS = 1  # of assigning and fitting, for each basis vector
+SETTLING = 4  # of them, at the beginning without basis vectors, and at the end with all
+CANDIDATES = 4  # clusters that an item may go to until all are compared again ...
+COMPARED = 6  # ... which is when this many basis vectors were added
+MORE = 4  # vectors that the search for principal components carries along
+PASSES = 1  # over the rows
+BLOCK = 1 << 22  # products with all clusters at a time
+NEGLIGIBLE = 1e-6  # of the first singular value: what is smaller is rounding
+COUNTED = 1e6  # squares of singular values within this factor of it are looked at twice
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Affine spaces, and the one of each item.
+
+    Attributes
+    ----------
+    labels : (n,) int64
+    means : (k, m) float32
+        A point of each space; zeros where spaces pass through the origin.
+    bases : (k, b, m) float32
+        Orthonormal rows, the most important first; zeros where a cluster has fewer dimensions.
+    """
+
+    labels: Indices
+    means: Floats
+    bases: Floats
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def with_labels(self, labels: Indices) -> Clusters:
+        """The same spaces."""
+        return Clusters(labels, self.means, self.bases)
+
+
+def standard_cpca(
+    rows: Floats,
+    weights: Floats,
+    clusters: int,
+    bases: int,
+    centred: bool = True,
+    seed: int = 0,
+    exhaustive: bool = True,
+    iterations: int = ITERATIONS,
+) -> Clusters:
+    """Clustered PCA as [SHHS03] has it: vectors are added one by one, with LBG iterations for each.
+
+    Parameters
+    ----------
+    rows : (n, g, m) float32
+        Of n items.
+    weights : (n,) float32
+        What an item's squared error counts.
+    clusters, bases : int
+        At most so many clusters, of so many basis vectors each.
+    centred : bool
+        Whether spaces pass through the clusters' means, or through the origin.
+    seed : int
+    exhaustive : bool
+        Whether all clusters are compared each time, or, most of the time, those that were nearest the last time.
+    iterations : int
+        For each basis vector.
+
+    Returns
+    -------
+    Clusters
+        None is empty.
+    """
+    found, compared = seeded(rows, weights, clusters, centred, seed), 0
+    for b in range(bases + 1):
+        for repeat in range(iterations if 0 < b < bases else SETTLING):
+            if exhaustive or (repeat == 0 and b % COMPARED == 0) or compared != len(found):
+                nearest = nearest_clusters(rows, found, 1 if exhaustive else CANDIDATES)
+                labels, compared = nearest[:, 0], len(found)
+            else:
+                labels = reassigned(rows, found, nearest)
+            found = fitted(rows, weights, found.with_labels(labels), b, centred)
+    return found
+
+
+def two_pass_cpca(
+    rows: Floats,
+    weights: Floats,
+    dense: Indices,
+    clusters: int,
+    bases: int,
+    centred: bool = True,
+    seed: int = 0,
+    iterations: int = ITERATIONS,
+) -> Clusters:
+    """Clustered PCA of few items; the others then join their nearest clusters, and all settle ([HR10] 6, Figure 7).
+
+    Parameters
+    ----------
+    rows : (n, g, m) float32
+    weights : (n,) float32
+    dense : (d,) int64
+        Items of the first pass.
+    clusters, bases, centred, seed, iterations
+        As ``standard_cpca`` has them.
+
+    Returns
+    -------
+    Clusters
+        Of all items.
+    """
+    found = standard_cpca(
+        rows[dense], weights[dense], clusters, bases, centred, seed, exhaustive=False, iterations=iterations
+    )
+    return settled(rows, weights, found, bases, centred)
+
+
+def settled(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
+    """All items (n, g, m) in their nearest clusters, which follow, a few times; no basis vectors are added."""
+    found, compared = clusters, 0
+    for _ in range(SETTLING):
+        if compared != len(found):
+            nearest = nearest_clusters(rows, found, CANDIDATES)
+            labels, compared = nearest[:, 0], len(found)
+        else:
+            labels = reassigned(rows, found, nearest)
+        found = fitted(rows, weights, found.with_labels(labels), bases, centred)
+    return found
+
+
+def seeded(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: int) -> Clusters:
+    """Clusters without basis vectors, around items that are far from each other (k-means++)."""
+    rng = np.random.default_rng(seed)
+    flat = rows.reshape(len(rows), -1)
+    norms = np.einsum("nm,nm->n", flat, flat).astype(np.float64)
+    distance = np.full(len(rows), np.inf)
+    chosen: list[int] = []
+    for _ in range(min(clusters, len(rows))):
+        chance = weights * (distance if chosen else np.maximum(norms, 1e-30))
+        if not chance.sum() > 1e-12 * (weights @ norms):  # all items are like one that was chosen
+            break
+        chosen.append(int(rng.choice(len(rows), p=chance / chance.sum())))
+        new = norms - 2 * (flat @ flat[chosen[-1]]) + norms[chosen[-1]]
+        distance = np.minimum(distance, np.maximum(new, 0))
+    chosen = chosen or [0]
+    centres = rows[chosen].mean(axis=1)  # [cluster, m]
+    empty = np.zeros((len(chosen), 0, rows.shape[2]), np.float32)
+    return Clusters(np.zeros(len(rows), np.int64), centres, empty)
+
+
+def fitted(
+    rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool, passes: int = PASSES
+) -> Clusters:
+    """Means and principal components of clusters whose labels are given; the old ones are where the search begins.
+
+    Empty clusters are given the items that are farthest from theirs, as long as these have any error, and disappear
+    otherwise.
+    """
+    clusters = _without_empty(rows, weights, clusters, centred)
+    counts = np.bincount(clusters.labels, minlength=len(clusters))
+    order = np.argsort(clusters.labels, kind="stable")
+    ends = np.cumsum(counts)
+    sizes = np.argsort(-counts, kind="stable")
+    turns = np.concatenate([sizes[::2], sizes[1::2]])  # threads take halves
+    start = np.ascontiguousarray(clusters.bases[:, :bases])
+    random = random_mixtures(counts.max() * rows.shape[1], bases - start.shape[1])
+    with threadpool_limits(1, user_api="blas"):
+        means, vectors = _fitted(rows, weights, order, ends, turns, start, bases, centred, passes, random)
+    return Clusters(clusters.labels, means, vectors)
+
+
+def random_mixtures(rows: int, missing: int) -> Floats:
+    """Coefficients (rows, any) of the combinations of rows that a search for components begins with."""
+    return np.random.default_rng(0).standard_normal((rows, max(missing, 0) + MORE), np.float32)
+
+
+@numba.njit(parallel=True, cache=True)
+def _fitted(
+    rows: Floats,
+    weights: Floats,
+    order: Indices,
+    ends: Indices,
+    turns: Indices,
+    start: Floats,
+    bases: int,
+    centred: bool,
+    passes: int,
+    random: Floats,
+) -> tuple[Floats, Floats]:
+    """``affine_space`` of all clusters; the items of cluster c are ``order[ends[c - 1] : ends[c]]``."""
+    k, g, m = len(ends), rows.shape[1], rows.shape[2]
+    means, vectors = np.zeros((k, m), np.float32), np.zeros((k, bases, m), np.float32)
+    for turn in numba.prange(k):
+        c = turns[turn]
+        first = ends[c - 1] if c > 0 else 0
+        own, shares = (
+            np.empty(((ends[c] - first) * g, m), np.float32),
+            np.empty((ends[c] - first) * g, np.float32),
+        )
+        for i in range(len(own)):
+            own[i], shares[i] = rows[order[first + i // g], i % g], weights[order[first + i // g]]
+        mean, found = affine_space(own, shares, bases, start[c], centred, passes, random)
+        means[c], vectors[c, : len(found)] = mean, found
+    return means, vectors
+
+
+@numba.njit(nogil=True, cache=True)
+def affine_space(
+    rows: Floats, weights: Floats, bases: int, start: Floats, centred: bool, passes: int, random: Floats
+) -> tuple[Floats, Floats]:
+    """Mean (m,) and principal components (at most ``bases``, m) of weighted rows (n, m).
+
+    Exact if rows are no more than these, else by subspace iteration from ``start`` (any, m) and combinations of rows
+    with random coefficients (>= n, any) (Halko, Martinsson and Tropp 2011, algorithm 4.4). Deviations from the mean
+    are never formed.
+    """
+    n, m = rows.shape
+    share = weights / np.float32(max(weights.sum(), np.float32(1e-30)))
+    roots = np.sqrt(share)
+    mean = np.dot(share, rows) if centred else np.zeros(m, np.float32)
+    if bases == 0:
+        return mean, np.zeros((0, m), np.float32)
+    if n <= bases + MORE:
+        vectors = _combined(rows, roots, mean, np.eye(n).astype(np.float32))
+    else:
+        mixed = _combined(rows, roots, mean, np.ascontiguousarray(random[:n]))
+        vectors = np.concatenate((start, mixed))
+        for _ in range(passes):
+            vectors = _combined(rows, roots, mean, _along(rows, roots, mean, _orthonormal(vectors)))
+    vectors = _orthonormal(vectors)
+    products = _along(rows, roots, mean, vectors).astype(np.float64)
+    values, turn = np.linalg.eigh(np.dot(products.T, products))
+    least = NEGLIGIBLE**2 * (values.max() if len(values) else 0.0)
+    if (values <= COUNTED * least).any() or len(values) < bases:  # what rounding leaves of equal rows
+        least = max(least, NEGLIGIBLE**2 * np.abs(rows).max() ** 2)
+    kept = min(bases, (values > least).sum())  # the last ones
+    turned = np.ascontiguousarray(turn[:, len(values) - kept :][:, ::-1].T.astype(np.float32))
+    return mean, np.dot(turned, vectors)
+
+
+@numba.njit(nogil=True, cache=True)
+def _along(rows: Floats, roots: Floats, mean: Floats, vectors: Floats) -> Floats:
+    """Products (n, b) of weighted deviations with vectors (b, m)."""
+    found = np.dot(rows, vectors.T)
+    offset = np.dot(vectors, mean)
+    for i in range(len(found)):
+        for k in range(len(offset)):
+            found[i, k] = roots[i] * (found[i, k] - offset[k])
+    return found
+
+
+@numba.njit(nogil=True, cache=True)
+def _combined(rows: Floats, roots: Floats, mean: Floats, products: Floats) -> Floats:
+    """Weighted deviations in combinations (n, b): (b, m)."""
+    weighted = np.empty_like(products)
+    sums = np.zeros(products.shape[1], np.float32)
+    for i in range(len(products)):
+        for k in range(len(sums)):
+            weighted[i, k] = roots[i] * products[i, k]
+            sums[k] += weighted[i, k]
+    found = np.dot(weighted.T, rows)
+    for k in range(len(sums)):
+        for j in range(len(mean)):
+            found[k, j] -= sums[k] * mean[j]
+    return found
+
+
+@numba.njit(nogil=True, cache=True)
+def _orthonormal(vectors: Floats) -> Floats:
+    """An orthonormal basis (at most b, m) of vectors (b, m); what depends on others within rounding is left out."""
+    wide = vectors.astype(np.float64)
+    squares, turn = np.linalg.eigh(np.dot(wide, wide.T))
+    largest = squares.max() if len(squares) else 0.0
+    kept = (squares > max(NEGLIGIBLE**2 * largest, 1e-36)).sum()
+    turn = turn[:, len(squares) - kept :] / np.sqrt(squares[len(squares) - kept :])
+    return np.dot(np.ascontiguousarray(turn.T), wide).astype(np.float32)
+
+
+def nearest_clusters(rows: Floats, clusters: Clusters, count: int) -> Indices:
+    """The nearest clusters (n, count) of each item, the nearest first."""
+    n, g, m = rows.shape
+    k, b = clusters.bases.shape[:2]
+    spaces = np.concatenate([clusters.means[:, None], clusters.bases], axis=1).reshape(-1, m).T
+    offsets = _offsets(clusters)
+    nearest = np.empty((n, min(count, k)), np.int64)
+    step = max(1, BLOCK // (g * k * (b + 1)))
+    for a in range(0, n, step):
+        products = (rows[a : a + step].reshape(-1, m) @ spaces).reshape(-1, g, k, b + 1)
+        _closest(products, offsets, nearest[a : a + step])
+    return nearest
+
+
+def _offsets(clusters: Clusters) -> Floats:
+    """Squared norm of each mean, then its products with the basis vectors, (k, 1 + b)."""
+    squares = np.einsum("km,km->k", clusters.means, clusters.means)
+    along = np.einsum("kbm,km->kb", clusters.bases, clusters.means)
+    return np.concatenate([squares[:, None], along], axis=1).astype(np.float32)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _closest(products: Floats, offsets: Floats, nearest: Indices) -> None:
+    """Of squared distances to affine spaces, but for the squared norm of the rows, the least.
+
+    products : (n, g, k, 1 + b), of rows with means and basis vectors; nearest : (n, count), filled in.
+    """
+    n, g, k, b = products.shape
+    count = nearest.shape[1]
+    for i in numba.prange(n):
+        best = np.full(count, np.float32(np.inf), np.float32)
+        for c in range(k):
+            distance = np.float32(0)
+            for row in range(g):
+                distance += offsets[c, 0] - 2 * products[i, row, c, 0]
+                for q in range(1, b):
+                    along = products[i, row, c, q] - offsets[c, q]
+                    distance -= along * along
+            if distance < best[count - 1]:
+                place = count - 1
+                while place > 0 and best[place - 1] > distance:
+                    best[place] = best[place - 1]
+                    nearest[i, place] = nearest[i, place - 1]
+                    place -= 1
+                best[place] = distance
+                nearest[i, place] = c
+
+
+def reassigned(rows: Floats, clusters: Clusters, candidates: Indices) -> Indices:
+    """The nearest of each item's candidates (n, any): labels (n,)."""
+    squares = squared_distances(rows, clusters, candidates)
+    return np.take_along_axis(candidates, squares.argmin(axis=1)[:, None], axis=1)[:, 0]
+
+
+def squared_distances(rows: Floats, clusters: Clusters, candidates: Indices) -> Floats:
+    """Of each item to some clusters (n, any), summed over its rows."""
+    return _squared_distances(rows, clusters.means, clusters.bases, candidates)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _squared_distances(rows: Floats, means: Floats, bases: Floats, candidates: Indices) -> Floats:
+    """Of items (n, g, m) to some clusters (n, any), summed over rows."""
+    squares = np.zeros(candidates.shape, np.float32)
+    for i in numba.prange(len(rows)):
+        away = np.empty(rows.shape[2], np.float32)
+        for which in range(candidates.shape[1]):
+            c, total = candidates[i, which], np.float32(0)
+            for row in range(rows.shape[1]):
+                for j in range(len(away)):
+                    away[j] = rows[i, row, j] - means[c, j]
+                    total += away[j] * away[j]
+                for k in range(bases.shape[1]):
+                    along = np.float32(0)
+                    for j in range(len(away)):
+                        along += away[j] * bases[c, k, j]
+                    total -= along * along
+            squares[i, which] = total
+    return squares
+
+
+def _without_empty(rows: Floats, weights: Floats, clusters: Clusters, centred: bool) -> Clusters:
+    counts = np.bincount(clusters.labels, minlength=len(clusters))
+    empty = np.flatnonzero(counts == 0)
+    if not len(empty):
+        return clusters
+    labels, bases = clusters.labels.copy(), clusters.bases.copy()
+    own = clusters.labels[:, None]
+    errors = weights * np.maximum(squared_distances(rows, clusters, own)[:, 0], 0)
+    errors[errors <= 1e-10 * (weights * np.einsum("ngm,ngm->n", rows, rows)).max(initial=0)] = 0
+    for c, i in zip(empty, np.argsort(-errors, kind="stable"), strict=False):
+        if errors[i] > 0 and counts[labels[i]] > 1:
+            counts[labels[i]] -= 1
+            labels[i], bases[c] = c, 0
+    kept, labels = np.unique(labels, return_inverse=True)
+    return Clusters(labels.astype(np.int64), clusters.means[kept], bases[kept])

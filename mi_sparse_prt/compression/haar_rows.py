@@ -1,0 +1,154 @@
+"""Rows of white transport as lists of Haar wavelet coefficients: a part of a matrix like any other ([NRH03]).
+
+Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), for which the wavelets are orthonormal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.haar import haar, inverse_haar
+
+Ids = NDArray[np.integer]
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class HaarRows:
+    """Rows as lists of wavelet coefficients: a part of a matrix that is compressed white transport.
+
+    Attributes
+    ----------
+    starts : (n_v * channels + 1,) int64
+        Where the coefficients of each vertex and channel begin in the next two arrays; channels of a vertex follow
+        each other.
+    places : (m,) uint16 or uint32
+        Which coefficients, ascending (``emission.haar`` has the layout).
+    values : (m,) float16
+    scales : (n_v, channels) float32
+        What the values are multiplied by.
+    lighting : CubemapLighting
+    """
+
+    starts: NDArray[np.int64]
+    places: NDArray[np.unsignedinteger]
+    values: NDArray[np.float16]
+    scales: Floats
+    lighting: CubemapLighting
+
+    @property
+    def nbytes(self) -> int:
+        return self.starts.nbytes + self.places.nbytes + self.values.nbytes + self.scales.nbytes
+
+    def rows(self, ids: Ids) -> Floats:
+        some, m = self.reordered(ids), self.lighting.n_directions
+        values = some.values * np.repeat(some.scales.ravel(), np.diff(some.starts))
+        lists = (values, some.places.astype(np.int32), some.starts)
+        coefficients = scipy.sparse.csr_array(lists, shape=(some.scales.size, m)).toarray()
+        white = inverse_haar(coefficients) * self._scale()
+        return np.ascontiguousarray(np.moveaxis(white.reshape(*some.scales.shape, m), 1, 2))
+
+    def columns(self, ids: Ids) -> Floats:
+        ids = np.asarray(ids)
+        single = np.zeros((self.lighting.n_directions, len(ids)), np.float32)
+        single[ids, np.arange(len(ids))] = 1
+        return self.project(single)
+
+    def relight(self, lighting: Floats) -> Floats:
+        colours = self._transformed(lighting)
+        if self.scales.shape[1] == 3:  # each channel has its own light
+            return self._products(np.ascontiguousarray(colours.T[..., None]))[..., 0]
+        return self._products(colours[None])[:, 0]
+
+    def project(self, vectors: Floats) -> Floats:
+        return np.ascontiguousarray(np.moveaxis(self._products(self._transformed(vectors)[None]), 1, 2))
+
+    def reordered(self, source: Ids) -> HaarRows:
+        channels = self.scales.shape[1]
+        lists = (np.asarray(source, np.int64)[:, None] * channels + np.arange(channels)).ravel()
+        counts = np.diff(self.starts)[lists]
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        entries = np.arange(starts[-1]) + np.repeat(self.starts[:-1][lists] - starts[:-1], counts)
+        return replace(
+            self,
+            starts=starts,
+            places=self.places[entries],
+            values=self.values[entries],
+            scales=self.scales[source],
+        )
+
+    def _transformed(self, vectors: Floats) -> Floats:
+        """Coefficients (n_directions, k) of vectors (n_directions, k)."""
+        return np.ascontiguousarray(haar((vectors * self._scale()[:, None]).T).T)
+
+    def _products(self, vectors: Floats) -> Floats:
+        """(n_v, channels, k) with transformed vectors (1 or channels, n_directions, k)."""
+        multiply = _times_three if vectors.shape[2] == 3 else _times
+        return multiply(self.starts, self.places, self.values.view(np.uint16), self.scales, vectors)
+
+    def _scale(self) -> Floats:
+        return np.sqrt(self.lighting.solid_angles, dtype=np.float32)
+
+
+@numba.njit(inline="always")
+def _number(half: int) -> np.float32:
+    """A float16 from its 16 bits: where float32 has them they mean 2^-112 of it, as exponents count from elsewhere."""
+    bits = np.uint32(((half & 0x8000) << 16) | ((half & 0x7FFF) << 13))
+    return bits.view(np.float32) * np.float32(2.0**112)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _times_three(
+    starts: NDArray[np.int64],
+    places: NDArray[np.unsignedinteger],
+    halves: NDArray[np.uint16],
+    scales: Floats,
+    vectors: Floats,
+) -> Floats:
+    """``_times`` with three vectors: the sums stay in registers. Slices keep checks of signs out of the loop."""
+    n, channels = scales.shape
+    result = np.empty((n, channels, 3), np.float32)
+    for i in numba.prange(n):
+        for c in range(channels):
+            light = vectors[c % len(vectors)]
+            first, last = starts[i * channels + c], starts[i * channels + c + 1]
+            own_places, own_halves = places[first:last], halves[first:last]
+            red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+            for e in range(len(own_places)):
+                value, j = _number(own_halves[e]), own_places[e]
+                red += value * light[j, 0]
+                green += value * light[j, 1]
+                blue += value * light[j, 2]
+            scale = scales[i, c]
+            result[i, c, 0], result[i, c, 1], result[i, c, 2] = red * scale, green * scale, blue * scale
+    return result
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _times(
+    starts: NDArray[np.int64],
+    places: NDArray[np.unsignedinteger],
+    halves: NDArray[np.uint16],
+    scales: Floats,
+    vectors: Floats,
+) -> Floats:
+    """Products (n, channels, k) of lists with vectors (1 or channels, m, k), the same for all channels or one each."""
+    n, channels = scales.shape
+    k = vectors.shape[2]
+    result = np.zeros((n, channels, k), np.float32)
+    for i in numba.prange(n):
+        for c in range(channels):
+            light, sums = vectors[c % len(vectors)], result[i, c]
+            first, last = starts[i * channels + c], starts[i * channels + c + 1]
+            own_places, own_halves = places[first:last], halves[first:last]
+            for e in range(len(own_places)):
+                value, j = _number(own_halves[e]) * scales[i, c], own_places[e]
+                for q in range(k):
+                    sums[q] += value * light[j, q]
+    return result

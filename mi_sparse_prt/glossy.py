@@ -1,0 +1,281 @@
+"""View-dependent light transport by in-out factors of BRDFs ([HR10] eq. 2 and 3).
+
+Radiance that leaves vertex x towards w_o is ``rho_x B(x) + sum_k g_k(w_o) B_k(x)``: the diffuse part of its BRDF, and
+the coefficients ``B_k = T_k L``. T_k has the visibility of x, traced once for all k, times f_k in the frame of x;
+indirect light is gathered by finite elements among white light and coefficients of all vertices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.evaluation import Evaluation
+from mi_sparse_prt.glossy_parts import FactoredVisibility
+from mi_sparse_prt.matrix import Factored, Visibility
+from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, diffuse_reflectance, factors_of
+from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
+from mi_sparse_prt.measurement.frames import beside_vertices, frames, vertex_tangents
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.settings import Settings
+from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.transport.glossy_gather import glossy_indirect
+
+TERMS = 4
+RAYS = 64
+TOLERANCE = 0.06  # of the first bounce, for its low rank
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """What one lighting makes of a glossy scene.
+
+    Attributes
+    ----------
+    white : (n_v, 3) float32
+        Irradiance / pi of each vertex.
+    terms : (n_v, K, 3) float32
+        B_k; zeros at vertices that are not glossy.
+    """
+
+    white: Floats
+    terms: Floats
+
+
+@dataclass(frozen=True)
+class GlossyTransport:
+    """Light transport of a scene with glossy surfaces, factored.
+
+    Attributes
+    ----------
+    lighting : CubemapLighting
+    albedo : (n_v, 3) float32
+        Of the diffuse part.
+    direct : FactoredVisibility
+        White light of all vertices, then the terms of the glossy ones.
+    indirect : Factored or None
+        The same rows.
+    tangents, normals : (n_v, 3) float32, world
+    material : (n_v,) int64
+        Number of a vertex's BRDF among ``factors``, -1 if it is diffuse.
+    factors : tuple of BrdfFactors
+    scene_hash : str
+    report : dict
+    """
+
+    lighting: CubemapLighting
+    albedo: Floats
+    direct: FactoredVisibility
+    indirect: Factored | None
+    tangents: Floats
+    normals: Floats
+    material: NDArray[np.int64]
+    factors: tuple[BrdfFactors, ...]
+    scene_hash: str
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def terms(self) -> int:
+        """K."""
+        return self.direct.terms
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the stored factors."""
+        return self.direct.nbytes + (self.indirect.nbytes if self.indirect else 0)
+
+    def term_rows(self, ids: NDArray[np.integer]) -> Floats:
+        """Rows (k, n_directions, channels) by their numbers in ``direct``."""
+        rows = self.direct.rows(ids)
+        return rows if self.indirect is None else rows + self.indirect.rows(ids)
+
+    def coefficients(self, lighting: Environment | ArrayLike) -> Coefficients:
+        """White light and terms of all vertices under an environment or L (n_directions, 3)."""
+        radiance = self.lighting.project(lighting)
+        found = self.direct.relight(radiance)
+        if self.indirect is not None:
+            found = found + self.indirect.relight(radiance)
+        n = len(self.albedo)
+        terms = np.zeros((n, self.terms, 3), np.float32)
+        terms[self.direct.glossy] = found[n:].reshape(-1, self.terms, 3)
+        return Coefficients(found[:n], terms)
+
+    def relight(self, lighting: Environment | ArrayLike, outgoing: ArrayLike) -> Floats:
+        """Radiance (n_v, 3) that leaves the vertices in world directions (n_v, 3) or (3,)."""
+        found = self.coefficients(lighting)
+        towards = np.broadcast_to(np.asarray(outgoing, np.float32), self.normals.shape)
+        towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        radiance = self.albedo * found.white
+        turn = frames(self.tangents, self.normals)
+        for number, factors in enumerate(self.factors):
+            own = np.flatnonzero(self.material == number)
+            local = np.einsum("nij,nj->ni", turn[own], towards[own])
+            g = factors.grid.interpolated(factors.outgoing, local)  # [term, channel, vertex]
+            lobes = np.broadcast_to(g, (len(g), 3, len(own)))
+            radiance[own] += np.einsum("kcn,nkc->nc", lobes, found.terms[own][:, : len(g)])
+        above = np.einsum("nd,nd->n", towards, self.normals) > 0
+        return np.where(above[:, None], radiance, 0).astype(np.float32)
+
+
+def precompute_glossy(
+    scene: Scene,
+    lighting: CubemapLighting,
+    terms: int = TERMS,
+    direct: str = "exact",
+    max_depth: int = 5,
+    rays: int = RAYS,
+    tolerance: float = TOLERANCE,
+    seed: int = 0,
+    progress: bool = True,
+) -> GlossyTransport:
+    """Compute the view-dependent light transport of a scene with glossy BSDFs.
+
+    Parameters
+    ----------
+    scene : Scene
+        BSDFs are diffuse or can be factored (``measurement.brdf_factors``).
+    lighting : CubemapLighting
+        The direction basis is used.
+    terms : int
+        K, of each BRDF.
+    direct : {"exact", "consensus"}
+        How visibility is found, once for all terms.
+    max_depth : int
+        As Mitsuba's ``path``: 2 = direct light only, -1 = no limit.
+    rays : int
+        Per vertex, that gather indirect light; a power of two.
+    tolerance : float
+        Relative L2 error that a low rank may cost the first bounce.
+    seed : int
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    GlossyTransport
+        With ``report``: ``seconds`` per phase, ``rays``, ``ranks``, ``glossy_vertices``, ``peak_memory_bytes``,
+        ``seed``, ``parameters``, ``versions``.
+
+    Raises
+    ------
+    PrtError
+        If an argument makes no sense or a BSDF cannot be factored, by name.
+    """
+    _check(terms, direct)
+    settings = Settings(lighting.resolution, "gather", "direction", max_depth, None, None, seed, None, 2)
+    reset_peak_memory()
+    clock = Stopwatch()
+    with clock.phase("setup"):
+        points = vertex_points(scene)
+        solver = DirectTransport(scene.normalised, lighting, points, "direction", 2, seed)
+    with clock.phase("factors"):
+        material, factors, albedo = factored_materials(scene, terms)
+        tangents = vertex_tangents(scene)
+    light = Evaluation(scene, solver, settings, max_depth != 2, clock, progress).direct_light(direct)
+    assert isinstance(light.direct, Visibility)
+    glossy = np.flatnonzero(material >= 0)
+    part = FactoredVisibility(
+        light.direct.bits,
+        scene.normals,
+        lighting,
+        glossy,
+        frames(tangents[glossy], scene.normals[glossy]),
+        material[glossy],
+        incident_tables(factors),
+    )
+    indirect = None
+    if max_depth != 2:
+        with clock.phase("indirect"):
+            shades, out = _channels(scene, albedo, outgoing_tables(factors))
+            indirect = glossy_indirect(scene, points, part, out, shades, rays, tolerance, max_depth, seed)
+    report = {
+        "seconds": clock.report(),
+        "rays": light.rays | ({} if indirect is None else {"gather": len(points) * rays}),
+        "ranks": () if indirect is None else indirect.ranks,
+        "glossy_vertices": len(glossy),
+        "peak_memory_bytes": peak_memory(),
+        "seed": seed,
+        "parameters": {
+            "terms": terms,
+            "direct": direct,
+            "max_depth": max_depth,
+            "rays": rays,
+            "tolerance": tolerance,
+        },
+        "versions": versions(),
+    }
+    return GlossyTransport(
+        lighting,
+        albedo,
+        part,
+        indirect,
+        tangents,
+        scene.normals,
+        material,
+        tuple(factors),
+        scene.hash,
+        report,
+    )
+
+
+def _check(terms: int, direct: str) -> None:
+    if terms < 1:
+        raise PrtError(f"terms must be at least 1, not {terms}")
+    if direct not in ("exact", "consensus"):
+        raise PrtError(f"direct {direct!r} is neither 'exact' nor 'consensus'")
+
+
+def factored_materials(scene: Scene, terms: int) -> tuple[NDArray[np.int64], list[BrdfFactors], Floats]:
+    """What BRDFs vertices have.
+
+    Returns
+    -------
+    material : (n_v,) int64
+        Number of each vertex's BRDF among the glossy ones, -1 if it is diffuse.
+    factors : list of BrdfFactors
+        Of these.
+    albedo : (n_v, 3) float32
+        Of the diffuse part of each vertex.
+    """
+    material, known = np.full(scene.n_vertices, -1), dict[bytes, int]()
+    factors: list[BrdfFactors] = []
+    albedo, surface = scene.albedo.copy(), beside_vertices(scene)
+    for mesh, own in zip(scene.meshes, scene.materials, strict=True):
+        if own.diffuse:
+            continue
+        digest = own.digest()
+        if digest not in known:
+            known[digest] = len(factors)
+            factors.append(factors_of(own.bsdf, mesh.name, terms))
+        material[mesh.vertices] = known[digest]
+        found = factors[known[digest]]
+        albedo[mesh.vertices] = found.diffuse
+        if found.varying_diffuse:
+            here = dr.arange(mi.UInt32, mesh.vertices.start, mesh.vertices.stop)
+            albedo[mesh.vertices] = diffuse_reflectance(
+                own.bsdf, mesh.name, dr.gather(mi.SurfaceInteraction3f, surface, here)
+            )
+    if not factors:
+        raise PrtError(
+            "no surface of the scene is glossy: use precompute, whose matrix is the same for all views"
+        )
+    return material, factors, albedo
+
+
+def _channels(scene: Scene, albedo: Floats, outgoing: Floats) -> tuple[Floats, Floats]:
+    """Albedos (n_v, channels) and g_k (channels, ...), one channel where all are alike."""
+    grey = scene.grey and np.ptp(outgoing, axis=4).max() <= 1e-6 * np.abs(outgoing).max()
+    count = 1 if grey else 3
+    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

@@ -1,0 +1,286 @@
+"""Interreflection among glossy surfaces by finite elements: terms of BRDFs are elements like vertices' white light.
+
+Light that leaves vertex y towards w_o is ``rho_y B_y + sum_l g_l(w_o) B_yl``: a diffuse part and the coefficients B_yl
+that incident factors f_l have found ([HR10] eq. 2-3, [Leh07] 2.5). What rays from x find of it, weighted by 1 (white
+light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of these.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.glossy_parts import FactoredVisibility
+from mi_sparse_prt.hashing import mix
+from mi_sparse_prt.matrix import Factored
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.transport.contacts import contacts
+from mi_sparse_prt.transport.gather import NEGLIGIBLE, FiniteElements
+from mi_sparse_prt.transport.gather_matrix import BEHIND, LANES, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.transport.lanes import PointArrays
+from mi_sparse_prt.transport.nodes import Nodes
+
+MOST_BOUNCES = 64  # where there is no limit
+
+Floats = NDArray[np.float32]
+
+
+class GlossyGather(FiniteElements):
+    """Indirect light of one channel at the vertices of a scene and of the terms of its glossy ones.
+
+    Rows are numbered as in ``FactoredVisibility``.
+
+    Parameters
+    ----------
+    matrix : (n, n) sparse float32
+        Of ``glossy_gather_matrix``.
+    albedo : (n,) float32
+        Of the diffuse part of each vertex; 1 for terms.
+    scene : Scene
+    points : Points
+        Of all vertices.
+    direct : FactoredVisibility
+    max_depth, seed : int
+        As for ``GatherTransport``.
+    """
+
+    def __init__(
+        self,
+        matrix: scipy.sparse.csr_array,
+        albedo: Floats,
+        scene: Scene,
+        points: Points,
+        direct: FactoredVisibility,
+        max_depth: int,
+        seed: int,
+    ) -> None:
+        term = np.tile(np.arange(1, direct.terms + 1), len(direct.glossy)).astype(np.uint64)
+        keys = [points.keys, mix(np.repeat(points.keys[direct.glossy], direct.terms) + term)]
+        super().__init__(
+            matrix,
+            albedo[None],
+            np.concatenate(keys),
+            Nodes(np.arange(direct.count), None),
+            contacts(scene, direct.lighting),
+            direct.lighting,
+            max_depth,
+            seed,
+        )
+
+    def bounces(self, even: Floats) -> int:
+        """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
+        total, count, light = 0.0, 0, even[:, None]
+        while count < (self.max_depth - 2 if self.max_depth >= 0 else MOST_BOUNCES):
+            light = self.matrix @ (self._albedo[0][:, None] * light)
+            peak = float(np.abs(light).max(initial=0))
+            if peak <= NEGLIGIBLE * total or peak == 0:
+                break
+            count, total = count + 1, total + peak
+        return count
+
+
+def glossy_gather_matrices(
+    scene: Scene,
+    points: Points,
+    direct: FactoredVisibility,
+    outgoing: Floats,
+    rays_per_vertex: int,
+    seed: int,
+) -> list[scipy.sparse.csr_array]:
+    """G (n, n) over white light of all vertices and terms of the glossy ones, one matrix per channel.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+        Of all vertices.
+    direct : FactoredVisibility
+        Whose rows these are; it has the frames and the incident factors.
+    outgoing : (channels, materials, size, size, K) float32
+        g_k.
+    rays_per_vertex : int
+        A power of two.
+    seed : int
+    """
+    surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
+    lobes = Lobes(direct, outgoing)
+    size = max(1, LANES // rays_per_vertex)
+    hits, into, out = [], [], []
+    for a in range(0, len(points), size):
+        ids = dr.arange(mi.UInt32, min(size, len(points) - a)) + dr.opaque(mi.UInt32, a)
+        ray, point, u = cosine_rays(arrays, ids, samples, seed)
+        vertex = surfaces.traced(ray, u)
+        weights, values = lobes.incident(point, ray.d), lobes.outgoing(vertex, -ray.d)
+        dr.eval(vertex, weights, values)
+        met = np.flatnonzero(vertex.numpy() < BEHIND)
+        hits.append(np.stack([point.numpy()[met], vertex.numpy()[met]]).astype(np.int64))
+        into.append(np.stack([np.ones(len(met), np.float32), *(w.numpy()[met] for w in weights)], axis=1))
+        out.append(np.stack([v.numpy()[met] for v in values], axis=1))
+    joined = np.concatenate(hits, axis=1), np.concatenate(into), np.concatenate(out)
+    return [_assembled(direct, rays_per_vertex, c, *joined) for c in range(len(outgoing))]
+
+
+class Lobes:
+    """Factors of BRDFs on the device, looked up at vertices; 0 at those that are not glossy."""
+
+    def __init__(self, direct: FactoredVisibility, outgoing: Floats) -> None:
+        n = len(direct.bits)
+        self._size, self._terms = direct.tables.shape[1], direct.terms
+        material = np.full(n, len(direct.tables), np.uint32)  # one more, which is dark
+        material[direct.glossy] = direct.materials
+        turn = np.zeros((n, 3, 3), np.float32)
+        turn[direct.glossy] = direct.frames
+        self._material = mi.UInt32(material)
+        self._axes = [mi.Vector3f(np.ascontiguousarray(turn[:, k].T)) for k in range(3)]
+        self._incident, self._outgoing = _with_dark(direct.tables), [_with_dark(t) for t in outgoing]
+
+    def incident(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
+        """Terms f_k(w) pi / cos for directions (world) that are cosine-distributed."""
+        local = self._local(vertex, direction, mi.Mask(True))
+        scale = dr.pi / dr.maximum(local.z, 1e-2)
+        return [scale * value for value in self._looked_up(self._incident, vertex, local, mi.Mask(True))]
+
+    def outgoing(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
+        """Terms g_k(w_o) of each channel in turn; ``vertex`` may be none."""
+        valid = vertex < BEHIND
+        local = self._local(vertex, direction, valid)
+        valid &= local.z > 0
+        return [v for table in self._outgoing for v in self._looked_up(table, vertex, local, valid)]
+
+    def _local(self, vertex: mi.UInt32, direction: mi.Vector3f, valid: mi.Mask) -> mi.Vector3f:
+        return mi.Vector3f(
+            *(dr.dot(dr.gather(mi.Vector3f, axis, vertex, valid), direction) for axis in self._axes)
+        )
+
+    def _looked_up(
+        self, table: mi.Float, vertex: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
+    ) -> list[mi.Float]:
+        material = dr.gather(mi.UInt32, self._material, vertex, valid)
+        return looked_up(table, self._size, self._terms, material, local, valid)
+
+
+def looked_up(
+    table: mi.Float, size: int, terms: int, material: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
+) -> list[mi.Float]:
+    """Values (terms) of tables (materials, size, size, terms), flattened, in directions of their frames; bilinear."""
+    half = 0.5 * (size - 1)
+    scale = half / (1 + dr.maximum(local.z, 0))
+    a, b = dr.fma(local.x, scale, half), dr.fma(local.y, scale, half)
+    column, row = (mi.UInt32(dr.clip(x, 0, size - 1.001)) for x in (a, b))
+    a, b = a - column, b - row
+    first = (material * size + row) * size + column
+    found = []
+    for k in range(terms):
+        total = mi.Float(0)
+        for step, weight in (
+            (0, (1 - a) * (1 - b)),
+            (1, a * (1 - b)),
+            (size, (1 - a) * b),
+            (size + 1, a * b),
+        ):
+            total += weight * dr.gather(mi.Float, table, (first + step) * terms + k, valid)
+        found.append(total)
+    return found
+
+
+def _with_dark(tables: Floats) -> mi.Float:
+    dark = np.zeros_like(tables[:1])
+    return mi.Float(np.concatenate([tables, dark]).ravel())
+
+
+def _assembled(
+    direct: FactoredVisibility,
+    rays: int,
+    channel: int,
+    hits: NDArray[np.int64],
+    into: Floats,
+    out: Floats,
+) -> scipy.sparse.csr_array:
+    """The matrix of one channel: rays (m,) with their point and vertex, ordered by points, and their factors."""
+    n, terms = len(direct.bits), direct.terms
+    number = np.full(n, -1)  # of a vertex among the glossy ones
+    number[direct.glossy] = np.arange(len(direct.glossy))
+    own = slice(channel * terms, (channel + 1) * terms)
+    entries = 1 + terms * (number[hits[1]] >= 0)  # of a ray, in each row that it is in
+    lengths = np.bincount(hits[0], weights=entries, minlength=n).astype(np.int64)
+    starts = np.concatenate(
+        [[0], np.cumsum(np.concatenate([lengths, np.repeat(lengths[direct.glossy], terms)]))]
+    )
+    columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    first = np.searchsorted(hits[0], np.arange(n + 1))
+    _fill(
+        first,
+        hits[1],
+        number,
+        into / np.float32(rays),
+        np.ascontiguousarray(out[:, own]),
+        starts,
+        columns,
+        values,
+    )
+    return scipy.sparse.csr_array((values, columns, starts), shape=(direct.count, direct.count))
+
+
+@numba.njit(parallel=True, cache=True)
+def _fill(
+    first: NDArray[np.int64],
+    seen: NDArray[np.int64],
+    number: NDArray[np.int64],
+    into: Floats,
+    out: Floats,
+    starts: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    values: Floats,
+) -> None:
+    """Rows of each point in turn: white light, then its terms; entries of a ray: white light, then terms."""
+    n, terms = len(number), out.shape[1]
+    for i in numba.prange(n):
+        for row in range(1 + terms if number[i] >= 0 else 1):
+            at = starts[i] if row == 0 else starts[n + number[i] * terms + row - 1]
+            for ray in range(first[i], first[i + 1]):
+                weight = into[ray, row]
+                columns[at], values[at] = seen[ray], weight
+                at += 1
+                other = number[seen[ray]]
+                if other >= 0:
+                    for k in range(terms):
+                        columns[at], values[at] = n + other * terms + k, weight * out[ray, k]
+                        at += 1
+
+
+def glossy_indirect(
+    scene: Scene,
+    points: Points,
+    direct: FactoredVisibility,
+    outgoing: Floats,
+    albedo: Floats,
+    rays_per_vertex: int,
+    tolerance: float,
+    max_depth: int,
+    seed: int,
+) -> Factored:
+    """Indirect light of all rows of ``direct``, factored per channel.
+
+    Parameters
+    ----------
+    scene, points, direct, outgoing, rays_per_vertex, seed
+        As for ``glossy_gather_matrices``.
+    albedo : (n_v, channels) float32
+        Of the diffuse part of each vertex.
+    tolerance : float
+        As for ``GatherTransport.indirect``.
+    max_depth : int
+    """
+    ones = np.ones(direct.count - len(albedo), np.float32)
+    found = []
+    for matrix, shade in zip(
+        glossy_gather_matrices(scene, points, direct, outgoing, rays_per_vertex, seed), albedo.T, strict=True
+    ):
+        solver = GlossyGather(matrix, np.concatenate([shade, ones]), scene, points, direct, max_depth, seed)
+        found.append(solver.indirect(direct, tolerance))
+    return Factored(tuple(f.left[0] for f in found), tuple(f.right[0] for f in found))
