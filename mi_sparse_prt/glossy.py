@@ -35,6 +35,8 @@ TERMS = 4
 RAYS = 64
 TOLERANCE = 0.06  # of the first bounce, for its low rank
 
+EVEN = 1e-6  # relative difference of channels that is none
+
 Floats = NDArray[np.float32]
 
 
@@ -198,7 +200,7 @@ def precompute_glossy(
     indirect = None
     if max_depth != 2:
         with clock.phase("indirect"):
-            shades, out = _channels(scene, albedo, outgoing_tables(factors))
+            shades, out = _channels(albedo, outgoing_tables(factors))
             indirect = glossy_indirect(scene, points, part, out, shades, rays, tolerance, max_depth, seed)
     report = {
         "seconds": clock.report(),
@@ -274,8 +276,10 @@ def factored_materials(scene: Scene, terms: int) -> tuple[NDArray[np.int64], lis
     return material, factors, albedo
 
 
-def _channels(scene: Scene, albedo: Floats, outgoing: Floats) -> tuple[Floats, Floats]:
+def _channels(albedo: Floats, outgoing: Floats) -> tuple[Floats, Floats]:
     """Albedos (n_v, channels) and g_k (channels, ...), one channel where all are alike."""
-    grey = scene.grey and np.ptp(outgoing, axis=4).max() <= 1e-6 * np.abs(outgoing).max()
+    grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
     count = 1 if grey else 3
-    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])
+    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(
+        np.moveaxis(outgoing, 4, 0)[:count]
+    )

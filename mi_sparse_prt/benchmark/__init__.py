@@ -2,6 +2,7 @@
 
 from mi_sparse_prt.benchmark.choices import measure_choices
 from mi_sparse_prt.benchmark.cpca import measure_cpca
+from mi_sparse_prt.benchmark.glossy import measure_glossy
 from mi_sparse_prt.benchmark.methods import measure_methods
 from mi_sparse_prt.benchmark.plans import measure_plans
 from mi_sparse_prt.benchmark.sizes import cost_against_size
@@ -12,6 +13,7 @@ __all__ = [
     "cost_against_size",
     "measure_choices",
     "measure_cpca",
+    "measure_glossy",
     "measure_methods",
     "measure_plans",
     "run_benchmark",

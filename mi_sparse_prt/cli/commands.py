@@ -19,6 +19,7 @@ from mi_sparse_prt.cli.tables import (
     benchmark_tables,
     choices_tables,
     cpca_tables,
+    glossy_tables,
     matrix_tables,
     methods_tables,
     plan_tables,
@@ -471,11 +472,15 @@ def benchmark(
         bool,
         typer.Option("--cpca", help="Compare clustered PCA in two passes with the standard one instead."),
     ] = False,
+    glossy: Annotated[
+        bool,
+        typer.Option("--glossy", help="Measure view-dependent transport of glossy surfaces instead."),
+    ] = False,
     figures: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Draw what --method, --choices, --time-error, --sizes or --cpca measures: PNG files there.",
+            help="Draw what --method, --choices, --time-error, --sizes, --cpca or --glossy measures: PNG files there.",
             show_default=False,
         ),
     ] = None,
@@ -492,7 +497,8 @@ def benchmark(
     With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
     With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
     With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
-    With --cpca --figures FOLDER: compression, the paper's Figure 11.
+    With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
+    images, its Figures 17 to 19.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -505,6 +511,7 @@ def benchmark(
         "--plans": plans,
         "--sizes": sizes,
         "--cpca": cpca,
+        "--glossy": glossy,
     }
     which = [name for name, given in asked.items() if given]
     if len(which) > 1:
@@ -533,6 +540,7 @@ def benchmark(
                     "--time-error": (benchmarks.time_against_error, time_error_tables),
                     "--plans": (benchmarks.measure_plans, plans_tables),
                     "--cpca": (benchmarks.measure_cpca, cpca_tables),
+                    "--glossy": (benchmarks.measure_glossy, glossy_tables),
                 }
                 measure, show = kinds["".join(which)]
                 command.report = measure(*case, progress=progress, **drawn)

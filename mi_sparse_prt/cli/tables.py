@@ -9,6 +9,7 @@ from rich.table import Table
 
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.validation.glossy import CAUSES
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -334,6 +335,31 @@ def cpca_tables(report: dict[str, Any]) -> list[Table]:
     if report["image"] is not None:
         whole.add_row("of a relit image", _share(report["image"]))
     return [table, whole]
+
+
+def glossy_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_glossy`` found."""
+    times = _table("Time", "", "time", "ratio")
+    seconds, ratios = report["seconds"], report["ratios"]
+    times.add_row("diffuse matrix", _duration(seconds["diffuse"]), "")
+    times.add_row(
+        f"glossy, {report['parameters']['terms']} terms",
+        _duration(seconds["glossy"]),
+        f"{ratios['glossy_over_diffuse']:.2f} x diffuse",
+    )
+    times.add_row(
+        "brute force",
+        _duration(seconds["brute_force"]),
+        f"{ratios['brute_force_over_glossy']:.0f} x glossy",
+    )
+    factors = _table("Factors of BRDFs (relative L2, held out)", "", "all pairs", "grazing", "peak")
+    for found in report["factors"]:
+        last = [_share(found[name][-1]) for name in ("whole", "grazing", "peak")]
+        factors.add_row(f"{found['mesh']}, {found['terms']} terms", *last)
+    images = _table("Images (largest relative L2)", "", *CAUSES)
+    for region, errors in report["images"]["worst"].items():
+        images.add_row(region.replace("_", " "), *(_share(errors[cause]) for cause in CAUSES))
+    return [times, factors, images]
 
 
 def _plan(plan: dict[str, Any]) -> str:

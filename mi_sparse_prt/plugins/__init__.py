@@ -3,6 +3,7 @@
 import mitsuba as mi
 
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
+from mi_sparse_prt.plugins.factored import InOutFactors
 from mi_sparse_prt.plugins.glossy import AshikhminShirley, Phong
 from mi_sparse_prt.plugins.mesh_vertices import MeshVertices
 from mi_sparse_prt.plugins.sparse_prt import SparsePRT
@@ -15,3 +16,4 @@ def register() -> None:
     mi.register_integrator("sparse_prt", SparsePRT)
     mi.register_bsdf("phong", Phong)
     mi.register_bsdf("ashikhmin_shirley", AshikhminShirley)
+    mi.register_bsdf("in_out_factors", InOutFactors)

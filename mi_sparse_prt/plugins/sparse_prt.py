@@ -10,7 +10,8 @@ import mitsuba as mi
 from mi_sparse_prt.cache import cached_precompute
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError, PrtWarning
-from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
+from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
+from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
 
@@ -49,6 +50,8 @@ class SparsePRT(mi.SamplingIntegrator):
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the matrix to aim at. (0: that of ``prt.precompute``)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
+    terms               integer    Of in-out factors: BSDFs that are not diffuse are then shaded for the view, per
+                                   pixel, by finite elements in the direction basis. (0: they count as diffuse)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
@@ -74,6 +77,8 @@ class SparsePRT(mi.SamplingIntegrator):
             "seed": props.get("seed", 0),
         }
         Settings(self._lighting.resolution, **self._settings)  # complains now, not when rendering
+        self._terms = props.get("terms", 0)
+        self._glossy: GlossyTransport | None = None  # of the scene that was rendered last
         self._edge_length = props.get("edge_length", 0.0) or None
         cache = props.get("cache", "")
         self._cache = Path(cache) if cache else None
@@ -114,9 +119,23 @@ class SparsePRT(mi.SamplingIntegrator):
                 stacklevel=2,
             )
         surfaces = Scene.from_mitsuba(scene, self._edge_length)
-        transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
-        relit = RelitScene(surfaces, transport.irradiance(environment), environment)
+        relit = self._relit(surfaces, environment)
         return RelitIntegrator(relit).render(scene, sensor, seed, spp, develop, evaluate)
+
+    def _relit(self, surfaces: Scene, environment: mi.Emitter) -> RelitScene:
+        if self._terms > 0:
+            if self._glossy is None or self._glossy.scene_hash != surfaces.hash:
+                self._glossy = precompute_glossy(
+                    surfaces,
+                    self._lighting,
+                    self._terms,
+                    max_depth=self._settings["max_depth"],
+                    seed=self._settings["seed"],
+                    progress=self._progress,
+                )
+            return GlossyRelitScene(surfaces, self._glossy, environment, environment)
+        transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
+        return RelitScene(surfaces, transport.irradiance(environment), environment)
 
     def to_string(self) -> str:
         return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"

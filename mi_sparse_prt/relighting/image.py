@@ -16,6 +16,7 @@ from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.measurement.factor_tables import outgoing_tables
+from mi_sparse_prt.plugins.factored import VaryingDiffuse
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.glossy_gather import looked_up
 
@@ -120,16 +121,28 @@ class GlossyRelitScene(RelitScene):
         self._glossy = mi.Bool(transport.material >= 0)
         tables = outgoing_tables(transport.factors)
         self._size = tables.shape[1]
+        first = {
+            number: own.bsdf for number, own in zip(_numbers(scene, transport), scene.materials, strict=True)
+        }
+        self._textures = {
+            number: VaryingDiffuse(first[number])
+            for number, factors in enumerate(transport.factors)
+            if factors.varying_diffuse
+        }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
 
     def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
         glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
+        material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
+        diffuse = interpolated(self._diffuse, corners, glossy)
+        for number, texture in self._textures.items():
+            textured = glossy & (material == number)
+            diffuse = dr.select(textured, mi.Color3f(texture.eval(si, textured)), diffuse)
         total = dr.select(
             glossy,
-            interpolated(self._irradiance, corners, glossy) * interpolated(self._diffuse, corners, glossy),
+            interpolated(self._irradiance, corners, glossy) * diffuse,
             super()._shaded(si, corners, valid),
         )
-        material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
         towards = si.to_world(si.wi)
         for vertex, weight in corners:
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
@@ -142,6 +155,11 @@ class GlossyRelitScene(RelitScene):
                 coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
                 total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)
         return total
+
+
+def _numbers(scene: Scene, transport: GlossyTransport) -> list[int]:
+    """Of each mesh's BRDF, -1 if it is diffuse."""
+    return [int(transport.material[mesh.vertices.start]) for mesh in scene.meshes]
 
 
 class RelitIntegrator(mi.SamplingIntegrator):

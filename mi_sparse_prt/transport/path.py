@@ -136,8 +136,8 @@ class PathTransport:
         element = lane // self.spp
         point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
         rng = random_generator(self._points.key(point), texel, lane - element * self.spp, seed)
-        radiance = self._radiance(point, texel, rng)
-        samples = [radiance[c] for c in range(self.channels)]
+        ray = self._first_ray(point, rng)
+        samples = self._weighted(point, ray.d, self._radiance(ray, texel, rng))
         powers = [x * x for x in samples]
         dr.eval(samples, powers)  # in one kernel
         sums, squares = (
@@ -166,12 +166,15 @@ class PathTransport:
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         return start_ray(self._points, point, mi.Frame3f(self._points.normal(point)).to_world(local))
 
-    def _radiance(self, point: mi.UInt32, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
-        """One sample of (1/pi) times the irradiance that reaches points by way of other surfaces, per d_omega.
+    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:
+        """One sample per channel of (1/pi) times the irradiance at points, by the radiance that their first rays find.
 
-        Cosine-distributed first rays make that the mean of the radiance they find.
+        These are cosine-distributed, which makes it the mean of that radiance, wherever they go.
         """
-        ray = self._first_ray(point, rng)
+        return [radiance[c] for c in range(self.channels)]
+
+    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
+        """One sample of the radiance that first rays find on other surfaces, per d_omega."""
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
         if self.basis == "direction":
             return _reflected(self.scene, ray, Light(self._texels.centre(texel), mi.Float(1)), rng, bounces)
@@ -232,7 +235,8 @@ def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, boun
             mi.Point2f(rng.next_float32(), rng.next_float32()),
             active,
         )
-        lit = active & ~dr.all(value <= 0)  # NaN is lit, so that it is noticed
+        # NaN is lit, so that it is noticed, and what factored BSDFs make negative
+        lit = active & ~dr.all(value == 0)
         lit &= ~scene.ray_test(si.spawn_ray(light.direction), lit)
         result += dr.select(lit, throughput * value * light.irradiance, 0)
 
@@ -248,7 +252,7 @@ def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, boun
             active &= (depth < bounces) | mirrored & (depth == bounces)
 
         # Russian roulette
-        survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(throughput), 0.95), 1)
+        survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(dr.abs(throughput)), 0.95), 1)
         active &= rng.next_float32() < survival
         throughput /= survival
     return result

@@ -45,6 +45,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "REFERENCE_SPP": 64,
         "METHODS": ["k_means_columns", "gather"],
     },
+    "04_glossy_and_compression": {
+        "RESOLUTION": 4,
+        "EDGE_LENGTH": 1e9,
+        "TERMS": 2,
+        "IMAGE_WIDTH": 96,
+        "IMAGE_SPP": 2,
+    },
 }
 
 
