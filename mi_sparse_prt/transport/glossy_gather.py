@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.hashing import mix
-from mi_sparse_prt.matrix import Factored
+from mi_sparse_prt.matrix import Factored, Part
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.contacts import contacts
@@ -71,6 +71,12 @@ class GlossyGather(FiniteElements):
             max_depth,
             seed,
         )
+
+    def _count_for(self, direct: Part) -> int:
+        """By the direct light of white surfaces: that of terms is dear, and joins with the first bounce."""
+        assert isinstance(direct, FactoredVisibility)
+        white = direct.white.relight(np.ones((self.lighting.n_directions, 3), np.float32))[:, 0]
+        return self.bounces(np.concatenate([white, np.zeros(direct.count - len(white), np.float32)]))
 
     def bounces(self, even: Floats) -> int:
         """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
