@@ -8,6 +8,7 @@ indirect light is gathered by finite elements among white light and coefficients
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -15,13 +16,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mi_sparse_prt.blocks import rows_times
+from mi_sparse_prt.compressed_parts import Clustered
 from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.evaluation import Evaluation
 from mi_sparse_prt.glossy_parts import FactoredVisibility
-from mi_sparse_prt.matrix import Factored, Visibility
+from mi_sparse_prt.matrix import Factored, MeshRange, Visibility
 from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, diffuse_reflectance, factors_of
 from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
 from mi_sparse_prt.measurement.frames import beside_vertices, frames, vertex_tangents
@@ -65,43 +68,79 @@ class GlossyTransport:
     lighting : CubemapLighting
     albedo : (n_v, 3) float32
         Of the diffuse part.
-    direct : FactoredVisibility
-        White light of all vertices, then the terms of the glossy ones.
+    areas : (n_v,) float32
+        Of the surface around each vertex, world units.
+    direct : FactoredVisibility, or Clustered
+        White light of all vertices, then the terms of the glossy ones. A compressed transport has direct and indirect
+        light together here.
     indirect : Factored or None
         The same rows.
     tangents, normals : (n_v, 3) float32, world
     material : (n_v,) int64
         Number of a vertex's BRDF among ``factors``, -1 if it is diffuse.
     factors : tuple of BrdfFactors
+    meshes : tuple of MeshRange
+    vertex_keys : (n_v,) uint64
     scene_hash : str
     report : dict
     """
 
     lighting: CubemapLighting
     albedo: Floats
-    direct: FactoredVisibility
+    areas: Floats
+    direct: FactoredVisibility | Clustered
     indirect: Factored | None
     tangents: Floats
     normals: Floats
     material: NDArray[np.int64]
     factors: tuple[BrdfFactors, ...]
+    meshes: tuple[MeshRange, ...]
+    vertex_keys: NDArray[np.uint64]
     scene_hash: str
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
     def terms(self) -> int:
         """K."""
-        return self.direct.terms
+        return max(factors.terms for factors in self.factors)
+
+    @cached_property
+    def glossy(self) -> NDArray[np.int64]:
+        """Numbers of the glossy vertices."""
+        return np.flatnonzero(self.material >= 0)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the stored factors."""
         return self.direct.nbytes + (self.indirect.nbytes if self.indirect else 0)
 
-    def term_rows(self, ids: NDArray[np.integer]) -> Floats:
-        """Rows (k, n_directions, channels) by their numbers in ``direct``."""
+    def white_rows(self, ids: NDArray[np.integer]) -> Floats:
+        """Rows (k, n_directions, channels) by their numbers in ``direct``, terms among them."""
         rows = self.direct.rows(ids)
         return rows if self.indirect is None else rows + self.indirect.rows(ids)
+
+    def project_white(self, vectors: Floats, ids: NDArray[np.integer]) -> Floats:
+        """Some rows times vectors (n_directions, r): (k, r, channels)."""
+        found = rows_times(lambda some: self.direct.rows(ids[some]), len(ids), vectors)
+        return found if self.indirect is None else found + self.indirect.reordered(ids).project(vectors)
+
+    def term_numbers(self, vertices: slice) -> tuple[NDArray[np.int64], Floats]:
+        """Rows of the terms of one mesh's vertices (n, K), and the mean squares of g_k over views (K, 3).
+
+        None where the mesh is not glossy. Views weigh by their cosine.
+        """
+        number = int(self.material[vertices.start])
+        if number < 0:
+            return np.zeros((vertices.stop - vertices.start, 0), np.int64), np.zeros((0, 3), np.float32)
+        first = int(np.searchsorted(self.glossy, vertices.start))
+        order = np.arange(first, first + vertices.stop - vertices.start)
+        rows = len(self.albedo) + order[:, None] * self.terms + np.arange(self.terms)
+        factors = self.factors[number]
+        weights = factors.grid.solid_angles * factors.grid.directions[:, 2] / np.pi
+        squares = np.square(factors.outgoing.astype(np.float64)) @ weights  # [term, channel]
+        result = np.zeros((self.terms, 3), np.float32)
+        result[: factors.terms] = squares
+        return rows, result
 
     def coefficients(self, lighting: Environment | ArrayLike) -> Coefficients:
         """White light and terms of all vertices under an environment or L (n_directions, 3)."""
@@ -111,7 +150,7 @@ class GlossyTransport:
             found = found + self.indirect.relight(radiance)
         n = len(self.albedo)
         terms = np.zeros((n, self.terms, 3), np.float32)
-        terms[self.direct.glossy] = found[n:].reshape(-1, self.terms, 3)
+        terms[self.glossy] = found[n:].reshape(-1, self.terms, 3)
         return Coefficients(found[:n], terms)
 
     def relight(self, lighting: Environment | ArrayLike, outgoing: ArrayLike) -> Floats:
@@ -219,16 +258,19 @@ def precompute_glossy(
         "versions": versions(),
     }
     return GlossyTransport(
-        lighting,
-        albedo,
-        part,
-        indirect,
-        tangents,
-        scene.normals,
-        material,
-        tuple(factors),
-        scene.hash,
-        report,
+        lighting=lighting,
+        albedo=albedo,
+        areas=scene.vertex_areas,
+        direct=part,
+        indirect=indirect,
+        tangents=tangents,
+        normals=scene.normals,
+        material=material,
+        factors=tuple(factors),
+        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+        vertex_keys=points.keys,
+        scene_hash=scene.hash,
+        report=report,
     )
 
 
@@ -280,6 +322,4 @@ def _channels(albedo: Floats, outgoing: Floats) -> tuple[Floats, Floats]:
     """Albedos (n_v, channels) and g_k (channels, ...), one channel where all are alike."""
     grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
     count = 1 if grey else 3
-    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(
-        np.moveaxis(outgoing, 4, 0)[:count]
-    )
+    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

@@ -16,6 +16,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import load_environment
 from mi_sparse_prt.errors import PrtWarning
 from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
+from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.measurement.brdf_factors import factor_error
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.planner.plan import Plan
@@ -115,6 +116,7 @@ def _brute_force(scene: Scene, transport: GlossyTransport) -> float:
     """Seconds of paths for all elements, white light and all terms at once."""
     points = vertex_points(scene)
     max_depth = transport.report["parameters"]["max_depth"]
+    assert isinstance(transport.direct, FactoredVisibility)
     paths = TermPaths(scene.normalised, transport.direct, points, max_depth, SPP)
     every = transport.lighting.n_directions
     chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]

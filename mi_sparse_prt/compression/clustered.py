@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -23,17 +24,20 @@ from threadpoolctl import threadpool_limits
 
 from mi_sparse_prt.compression.cpca import Clusters, affine_space, random_mixtures, two_pass_cpca
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import LightTransport, MeshRange
 
 COORDINATES = 192  # at most
-SAMPLE = 1536  # rows that span their space
+SAMPLE = 1024  # rows that span their space
 DENSE = 5  # one row in so many finds the clusters
+EXPANDED = 64  # vertices at a time whose rows stay in the cache
 FITTED = 4096  # rows of a cluster that its basis is made of, at most
 FINAL_PASSES = 2
 WORKERS = 2  # threads that fit clusters while another expands the rows of the next
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -95,9 +99,14 @@ class SphereRows:
 
     def rows(self, ids: Indices) -> Floats:
         """(k, r * channels, n_directions)."""
-        white = self._transport.white_rows(self.items.rows[ids].ravel())  # [row, direction, channel]
-        result = np.ascontiguousarray(np.moveaxis(white, 2, 1)).reshape(len(ids), -1, white.shape[1])
-        result /= self.scale
+        result = np.empty((len(ids), self.items.shades.shape[1], len(self.scale)), np.float32)
+        per_item = self.items.rows.shape[1]
+        for a in range(0, len(ids), EXPANDED):
+            some = ids[a : a + EXPANDED]
+            white = self._transport.white_rows(self.items.rows[some].ravel())  # [row, direction, channel]
+            by_channel = np.moveaxis(white, 2, 1).reshape(len(some), per_item, -1, len(self.scale))
+            into = result[a : a + EXPANDED].reshape(by_channel.shape)
+            np.divide(by_channel, self.scale, out=into)
         return result
 
     def span(self) -> Floats:
@@ -117,14 +126,21 @@ class SphereRows:
         return found.reshape(len(self), self.items.shades.shape[1], len(span))
 
 
-def mesh_rows(transport: LightTransport, mesh: MeshRange) -> SphereRows:
-    """The rows of one mesh."""
+def mesh_rows(transport: LightTransport | GlossyTransport, mesh: MeshRange) -> SphereRows:
+    """The rows of one mesh; a glossy vertex has those of its terms, too.
+
+    Terms count in T as their outgoing factors do on average over views, which are orthogonal to each other.
+    """
     own = mesh.vertices
-    shades = np.square(transport.albedo[own])
-    if transport.white_rows(np.arange(own.start, own.start + 1)).shape[2] == 1:  # it stands for three
-        shades = shades.sum(axis=1, keepdims=True)
-    ids = np.arange(own.start, own.stop)[:, None]
-    return SphereRows(transport, Items(ids, transport.areas[own], shades, transport.vertex_keys[own]))
+    rows, shades = np.arange(own.start, own.stop)[:, None], np.square(transport.albedo[own])[:, None]
+    if isinstance(transport, GlossyTransport):
+        numbers, factors = transport.term_numbers(own)
+        rows = np.concatenate([rows, numbers], axis=1)
+        shades = np.concatenate([shades, np.broadcast_to(factors, (len(rows), *factors.shape))], axis=1)
+    if transport.white_rows(rows[:1, 0]).shape[2] == 1:  # it stands for three
+        shades = shades.sum(axis=2, keepdims=True)
+    shades = shades.reshape(len(rows), -1).astype(np.float32)
+    return SphereRows(transport, Items(rows, transport.areas[own], shades, transport.vertex_keys[own]))
 
 
 @dataclass(frozen=True)
@@ -197,56 +213,65 @@ def finished(rows: SphereRows, found: Clusters, span: Floats, centred: bool = Tr
         What these are coordinates of.
     centred : bool
     """
-    k, b, m = *found.bases.shape[:2], span.shape[1]
-    members = [np.flatnonzero(found.labels == c) for c in range(k)]
-    order = np.argsort([-len(some) for some in members], kind="stable")
-    means, vectors = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
-    channels = rows.items.shades.shape[1]
-    coefficients = np.zeros((len(rows), channels, b), np.float16)
-    left, sums, squared_scale = np.zeros(b + 1), np.zeros(3), np.square(rows.scale)
-
-    one, random = np.ones((FITTED, channels, 1), np.float32), random_mixtures(FITTED * channels, 0)
-
-    def fit(c: int, first: Floats, ids: Indices) -> None:
-        weights = np.repeat(rows.weights[ids[: len(first)]], channels)
-        mean, basis = affine_space(
-            first.reshape(-1, m), weights, b, found.bases[c] @ span, centred, FINAL_PASSES, random
-        )
-        means[c], vectors[c, : len(basis)] = mean, basis
-
-    def project(c: int, some: Floats, ids: Indices) -> None:
-        mean, basis = means[c].astype(np.float32), vectors[c].astype(np.float32)
-        shades, weights = rows.items.shades[ids], rows.weights[ids].astype(np.float64)
-        squares, norms = _squares(some, squared_scale)
-        coefficients[ids] = some @ basis.T - mean @ basis.T
-        along = coefficients[ids].astype(np.float32)
-        some -= np.concatenate([along, one[: len(ids)]], axis=2) @ np.concatenate([basis, mean[None]])
-        errors, left_out = _squares(some, squared_scale)
-        kept = np.square(along, dtype=np.float64).sum(axis=1)  # [vertex, vector]
-        by_count = errors.sum(axis=1)[:, None] + np.cumsum(kept[:, ::-1], axis=1)[:, ::-1]
-        left[:-1] += weights @ by_count
-        left[-1] += weights @ errors.sum(axis=1)
-        sums[0] += weights @ squares.sum(axis=1)
-        sums[1] += (shades * left_out).sum()
-        sums[2] += (shades * norms).sum()
-
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(WORKERS) as pool:
-        pending: deque[Future[None]] = deque()
-        for c, ids, some, is_first in _blocks(rows, members, order):
-            while len(pending) > WORKERS:
-                pending.popleft().result()
-
-            def work(c: int = c, ids: Indices = ids, some: Floats = some, is_first: bool = is_first) -> None:
-                if is_first:
-                    fit(c, some, ids)
-                project(c, some, ids)
-
-            pending.append(pool.submit(work))
+    spaces, sums = _Spaces(rows, found, span, centred), np.zeros(found.bases.shape[1] + 4)
+    with threadpool_limits(1, user_api="blas"), _one_thread(), ThreadPoolExecutor(WORKERS) as pool:
+        pending: deque[Future[Doubles]] = deque()
+        for c, ids, some, is_first in _blocks(rows, found):
+            while len(pending) > (WORKERS if is_first else 0):  # later blocks need the space of the first
+                sums += pending.popleft().result()  # in order: the same sums in each run
+            pending.append(pool.submit(spaces.fill, c, ids, some, is_first))
         for future in pending:
-            future.result()
-    return MeshClusters(
-        found.labels, coefficients, means, vectors, np.maximum(left, 0), sums[0], sums[1], sums[2]
-    )
+            sums += future.result()
+    left, rest = np.maximum(sums[:-3], 0), sums[-3:]
+    return MeshClusters(found.labels, spaces.coefficients, spaces.means, spaces.bases, left, *rest.tolist())
+
+
+class _Spaces:
+    """The spaces of all clusters and the coefficients of all vertices, filled in block by block."""
+
+    def __init__(self, rows: SphereRows, found: Clusters, span: Floats, centred: bool) -> None:
+        self._rows, self._found, self._span, self._centred = rows, found, span, centred
+        k, b, m, lines = *found.bases.shape[:2], span.shape[1], rows.items.shades.shape[1]
+        self.means, self.bases = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
+        self.coefficients = np.zeros((len(rows), lines, b), np.float16)
+        self._random = random_mixtures(FITTED * lines, 0)
+        self._squared_scale = np.square(rows.scale)
+
+    def fill(self, c: int, ids: Indices, some: Floats, is_first: bool) -> Doubles:
+        """Take rows (n, r * channels, m) of one cluster, which are lost: what they add to ``left`` and other sums."""
+        if is_first:
+            self._fit(c, ids, some.reshape(-1, some.shape[2]))
+        mean, basis = self.means[c].astype(np.float32), self.bases[c].astype(np.float32)
+        shades, weights = self._rows.items.shades[ids], self._rows.weights[ids].astype(np.float64)
+        squares, norms = _squares(some, self._squared_scale)
+        self.coefficients[ids] = some @ basis.T - mean @ basis.T
+        along = self.coefficients[ids].astype(np.float32)
+        one = np.ones((*along.shape[:2], 1), np.float32)
+        some -= np.concatenate([along, one], axis=2) @ np.concatenate([basis, mean[None]])
+        errors, left_out = _squares(some, self._squared_scale)
+        kept = np.square(along, dtype=np.float64).sum(axis=1)[:, ::-1]  # [vertex, vector], the last one first
+        more = np.cumsum(np.column_stack([errors.sum(axis=1), kept]), axis=1)[
+            :, ::-1
+        ]  # [vertex, vectors that count]
+        rest = weights @ squares.sum(axis=1), (shades * left_out).sum(), (shades * norms).sum()
+        return np.concatenate([weights @ more, rest])
+
+    def _fit(self, c: int, ids: Indices, rows: Floats) -> None:
+        weights = np.repeat(self._rows.weights[ids], len(rows) // len(ids))
+        start, b = self._found.bases[c] @ self._span, self.bases.shape[1]
+        mean, basis = affine_space(rows, weights, b, start, self._centred, FINAL_PASSES, self._random)
+        self.means[c], self.bases[c, : len(basis)] = mean, basis
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let kernels that this thread calls use no others: theirs would wait busily for the next one."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
@@ -265,11 +290,10 @@ def _squares(rows: Floats, weights: Floats) -> tuple[NDArray[np.float64], NDArra
     return plain, weighted
 
 
-def _blocks(
-    rows: SphereRows, members: list[Indices], order: Indices
-) -> Iterator[tuple[int, Indices, Floats, bool]]:
+def _blocks(rows: SphereRows, found: Clusters) -> Iterator[tuple[int, Indices, Floats, bool]]:
     """Clusters, the largest first, in blocks of rows; the first block of each is a fair sample."""
-    for c in order:
+    members = [np.flatnonzero(found.labels == c) for c in range(len(found))]
+    for c in np.argsort([-len(some) for some in members], kind="stable"):
         ids = members[c]
         if len(ids) > FITTED:
             ids = np.random.default_rng(0).permutation(ids)

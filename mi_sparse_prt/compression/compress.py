@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.compression.truncation import TARGET, haar_part
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.matrix import LightTransport
 
 PER_CLUSTER = 300  # vertices, by default ...
@@ -23,21 +25,24 @@ ROWS = 1024  # of both matrices, expanded at a time
 NEARLY = 1.1  # times the target: predicted errors up to this are looked at
 ATTEMPTS = 5  # of which each has twice the clusters of the last
 
+AnyTransport = TypeVar("AnyTransport", LightTransport, GlossyTransport)
+
 
 def compress(
-    transport: LightTransport,
+    transport: AnyTransport,
     method: str = "cpca",
     clusters: int | dict[str, int] | None = None,
     bases: int = 24,
     target_error: float | None = None,
     seed: int = 0,
     progress: bool = True,
-) -> LightTransport:
+) -> AnyTransport:
     """Compress a light transport matrix for relighting.
 
     Parameters
     ----------
-    transport : LightTransport
+    transport : LightTransport or GlossyTransport
+        Rows of a glossy vertex, white light and terms, share its cluster ([Leh07] 3.3).
     method : {"cpca", "haar"}
         Clustered principal components, per mesh ([SHHS03], [HR10] 6), or the largest Haar wavelet coefficients of each
         row ([NRH03]), which knows neither ``clusters`` nor ``bases`` nor ``seed``.
@@ -54,7 +59,7 @@ def compress(
 
     Returns
     -------
-    LightTransport
+    LightTransport or GlossyTransport
         Whose one part, white transport of direct and indirect light together, is compressed. ``report`` is the given
         matrix's with ``compression``: ``method``, ``clusters`` per mesh, ``bases``, ``error`` (relative L2, per mesh
         and ``total``, of T and ``on_sphere``: weighted by vertex area, solid angles divided out), ``nbytes``,
@@ -64,11 +69,11 @@ def compress(
     Raises
     ------
     PrtError
-        If an argument makes no sense, or the matrix is compressed already.
+        If an argument makes no sense, the matrix is compressed already, or glossy and ``method`` is "haar".
     """
     _check(transport, method, clusters, bases, target_error)
     clock = Stopwatch()
-    if method == "haar":
+    if method == "haar" and isinstance(transport, LightTransport):
         with clock.phase("haar"):
             wavelets, report = haar_part(transport, target_error or TARGET, progress)
         report = transport.report | {"compression": {"method": method, **report, "seconds": clock.report()}}
@@ -92,14 +97,14 @@ def compress(
         "bases": part.bases.shape[1],
         "error": errors | {"on_sphere": _errors(transport, [(mesh.left[-1], mesh.energy) for mesh in found])},
         "nbytes": compressed.nbytes,
-        "ratio": 4 * np.prod(transport.shape[:2]) * found[0].coefficients.shape[1] / compressed.nbytes,
+        "ratio": 4 * part.coefficients[..., 0].size * part.lighting.n_directions / compressed.nbytes,
         "seconds": clock.report(),
     }
     return compressed
 
 
 def _check(
-    transport: LightTransport,
+    transport: LightTransport | GlossyTransport,
     method: str,
     clusters: int | dict[str, int] | None,
     bases: int,
@@ -109,6 +114,8 @@ def _check(
         raise PrtError(f"method {method!r} is none of: {', '.join(METHODS)}")
     if isinstance(transport.direct, Clustered | HaarRows):
         raise PrtError("this matrix is compressed already; give the one that it was made of")
+    if method == "haar" and isinstance(transport, GlossyTransport):
+        raise PrtError("method 'haar' is for matrices of diffuse surfaces; compress this one by 'cpca'")
     if method == "haar" and clusters is not None:
         raise PrtError("clusters are of method 'cpca'; leave them out, or the method")
     names = {mesh.name for mesh in transport.meshes}
@@ -123,20 +130,20 @@ def _check(
         raise PrtError(f"target_error must be between 0 and 1, not {target_error}")
 
 
-def default_clusters(transport: LightTransport) -> dict[str, int]:
+def default_clusters(transport: AnyTransport) -> dict[str, int]:
     """Clusters of each mesh, by its number of vertices."""
     sizes = {mesh.name: mesh.vertices.stop - mesh.vertices.start for mesh in transport.meshes}
     return {name: min(MOST_CLUSTERS, max(1, round(n / PER_CLUSTER))) for name, n in sizes.items()}
 
 
-def _counts(transport: LightTransport, clusters: int | dict[str, int] | None) -> dict[str, int]:
+def _counts(transport: AnyTransport, clusters: int | dict[str, int] | None) -> dict[str, int]:
     counts = default_clusters(transport)
     given = clusters if isinstance(clusters, dict) else dict.fromkeys(counts, clusters)
     return counts | {name: count for name, count in given.items() if count is not None}
 
 
 def _clustered(
-    transport: LightTransport, counts: dict[str, int], bases: int, seed: int, progress: bool
+    transport: AnyTransport, counts: dict[str, int], bases: int, seed: int, progress: bool
 ) -> list[MeshClusters]:
     with tqdm(total=len(transport.albedo), desc="compress", unit=" vertices", disable=not progress) as bar:
         found = []
@@ -146,7 +153,7 @@ def _clustered(
     return found
 
 
-def _errors(transport: LightTransport, sums: list[tuple[float, float]]) -> dict[str, float]:
+def _errors(transport: AnyTransport, sums: list[tuple[float, float]]) -> dict[str, float]:
     """Relative L2 of each mesh and ``total``, from squared errors and squared norms."""
     errors = {mesh.name: _root(*pair) for mesh, pair in zip(transport.meshes, sums, strict=True)}
     return errors | {"total": _root(*np.sum(sums, axis=0))}
@@ -157,7 +164,7 @@ def _root(squares: float, norms: float) -> float:
 
 
 def _with_fewer_bases(
-    transport: LightTransport, found: list[MeshClusters], target: float
+    transport: AnyTransport, found: list[MeshClusters], target: float
 ) -> tuple[list[MeshClusters], dict[str, float]]:
     """As few basis vectors as meet the target; what is left out on the sphere tells how many, then T does."""
     norms = sum(mesh.norms for mesh in found)
@@ -172,29 +179,38 @@ def _with_fewer_bases(
     return found, _errors(transport, [(mesh.squares, mesh.norms) for mesh in found])
 
 
-def matrix_errors(exact: LightTransport, other: LightTransport) -> dict[str, float]:
+def matrix_errors(exact: AnyTransport, other: AnyTransport) -> dict[str, float]:
     """Relative L2 of one matrix against another of the same vertices, per mesh and ``total``."""
     sums = []
     for mesh in exact.meshes:
-        pair = np.zeros(2)
-        for a in range(mesh.vertices.start, mesh.vertices.stop, ROWS):
-            ids = np.arange(a, min(a + ROWS, mesh.vertices.stop))
-            shades = np.square(exact.albedo[ids], dtype=np.float64)[:, None]  # [vertex, direction, rgb]
-            truth = exact.white_rows(ids)
-            for k, values in enumerate((other.white_rows(ids) - truth, truth)):
-                pair[k] += (shades[:, 0] * np.square(values).sum(axis=1, dtype=np.float64)).sum()
+        truth, ours = mesh_rows(exact, mesh), mesh_rows(other, mesh)
+        squares, pair = np.square(truth.scale), np.zeros(2)
+        for a in range(0, len(truth), ROWS):
+            ids = np.arange(a, min(a + ROWS, len(truth)))
+            rows = truth.rows(ids)
+            for k, values in enumerate((ours.rows(ids) - rows, rows)):
+                pair[k] += (truth.items.shades[ids] * (np.square(values) @ squares)).sum(dtype=np.float64)
         sums.append((float(pair[0]), float(pair[1])))
     return _errors(exact, sums)
 
 
-def _joined(transport: LightTransport, found: list[MeshClusters]) -> Clustered:
+def _joined(transport: AnyTransport, found: list[MeshClusters]) -> Clustered:
     """One part of all meshes."""
+    rows = [mesh_rows(transport, mesh).items.rows for mesh in transport.meshes]
     firsts = np.cumsum([0, *(len(mesh.means) for mesh in found)])
-    kind = np.uint16 if firsts[-1] <= np.iinfo(np.uint16).max + 1 else np.uint32
+    kind: type[np.unsignedinteger] = np.uint16 if firsts[-1] <= 1 << 16 else np.uint32
     widest = max(mesh.bases.shape[1] for mesh in found)
+    count, channels = sum(some.size for some in rows), found[0].coefficients.shape[1] // rows[0].shape[1]
+    labels: NDArray[np.unsignedinteger] = np.empty(count, kind)
+    coefficients = np.zeros((count, channels, widest), np.float16)
+    for mesh, some, first in zip(found, rows, firsts, strict=False):
+        labels[some] = (mesh.labels + first)[:, None]
+        coefficients[some, :, : mesh.bases.shape[1]] = mesh.coefficients.reshape(
+            *some.shape, channels, mesh.bases.shape[1]
+        )
     return Clustered(
-        np.concatenate([mesh.labels + a for mesh, a in zip(found, firsts, strict=False)]).astype(kind),
-        np.concatenate([_padded(mesh.coefficients, 2, widest) for mesh in found]),
+        labels,
+        coefficients,
         np.concatenate([mesh.means for mesh in found]),
         np.concatenate([_padded(mesh.bases, 1, widest) for mesh in found]),
         transport.lighting,

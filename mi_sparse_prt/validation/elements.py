@@ -20,7 +20,9 @@ BLOCK = (
 EXPANDED = 512  # compressed rows at a time
 
 Ids = NDArray[np.integer]
-AnyPart = Visibility | FractionalVisibility | MeanCosine | Indirect | Interpolated | Factored | HaarRows | Clustered
+AnyPart = (
+    Visibility | FractionalVisibility | MeanCosine | Indirect | Interpolated | Factored | HaarRows | Clustered
+)
 
 
 def elements(part: AnyPart, ids: Ids, texels: Ids) -> NDArray[np.float32]:

@@ -31,8 +31,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
     "02_sparse_precomputation": {
         "RESOLUTION": 8,
-        "EDGE_LENGTH": 1.0,
-        "SPP": 2,
+        "EDGE_LENGTH": 2.0,
+        "SPP": 1,
         "IMAGE_WIDTH": 96,
         "RADII": [0.1, 0.2],
         "RADIUS_VERTICES": 20,
@@ -49,6 +49,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "RESOLUTION": 4,
         "EDGE_LENGTH": 1e9,
         "TERMS": 2,
+        "DIFFUSE_SCENE": "terrace",
         "IMAGE_WIDTH": 96,
         "IMAGE_SPP": 2,
     },

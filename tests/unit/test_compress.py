@@ -10,6 +10,7 @@ from conftest import made_up
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression import clustered
 from mi_sparse_prt.compression.clustered import finished, mesh_rows
 from mi_sparse_prt.compression.compress import matrix_errors
 from mi_sparse_prt.compression.cpca import Clusters, settled, standard_cpca
@@ -116,6 +117,17 @@ def test_a_coloured_scene_shares_clusters_among_channels() -> None:
     part = prt.compress(transport, clusters=2, bases=5, progress=False).direct
     assert part.coefficients.shape == (50, 3, 5)
     assert len(part.labels) == 50
+
+
+def test_clusters_that_are_fitted_to_some_of_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All rows have coefficients then, and errors are those of all."""
+    monkeypatch.setattr(clustered, "FITTED", 8)
+    transport = made_up("bits and factored light")
+    compressed = prt.compress(transport, clusters=1, bases=4, progress=False)
+    found = relative(every_row(compressed), every_row(transport))
+    assert compressed.report["compression"]["error"]["total"] == pytest.approx(found, rel=2e-3)
+    again = prt.compress(transport, clusters=1, bases=4, progress=False)
+    assert again.report["compression"]["error"] == compressed.report["compression"]["error"]
 
 
 def test_black_and_equal_rows() -> None:

@@ -1,0 +1,94 @@
+"""``benchmark --cpca`` and ``--glossy`` from end to end on tiny scenes: reports, pictures, tables."""
+
+import io
+import json
+
+import matplotlib.image
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import build, diffuse
+from rich.console import Console
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark import cpca, glossy
+from mi_sparse_prt.cli.tables import cpca_tables, glossy_tables
+from mi_sparse_prt.scene import Scene
+
+
+def tiny(bsdf: dict) -> Scene:
+    """A ball on a plane, with a camera and a sky."""
+    flat = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(2)
+    view = mi.ScalarTransform4f().look_at([1, 1.5, 3], [0, 0.4, 0], [0, 1, 0])
+    return build(
+        0.4,
+        ball={"type": "sphere", "center": [0, 0.5, 0], "radius": 0.5, "bsdf": bsdf},
+        ground={"type": "rectangle", "to_world": flat, "bsdf": diffuse(0.5, 0.5, 0.5)},
+        sky={"type": "constant", "radiance": 1.0},
+        camera={
+            "type": "perspective",
+            "to_world": view,
+            "film": {"type": "hdrfilm", "width": 48, "height": 36},
+        },
+    )
+
+
+def printed(tables: list) -> str:
+    console = Console(file=io.StringIO(), width=160)
+    for table in tables:
+        console.print(table)
+    return console.file.getvalue()
+
+
+def test_cpca(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways see the same rows; errors of two passes are those of the compressed matrix."""
+    monkeypatch.setattr(cpca, "BASES", 6)
+    monkeypatch.setattr(cpca, "SPP", 4)
+    report = cpca.measure_cpca(tiny(diffuse(0.7, 0.7, 0.7)), prt.CubemapLighting(4), False, tmp_path)
+    json.dumps(report)
+    assert report["meshes"].keys() == {"ball", "ground"}
+    for found in report["meshes"].values():
+        assert 0 < found["standard"]["error"] < 0.5
+        assert found["error_increase"] == pytest.approx(
+            found["two_pass"]["error"] / found["standard"]["error"] - 1
+        )
+        assert abs(found["error_increase"]) < 0.5
+        assert found["faster"] == pytest.approx(found["standard"]["seconds"] / found["two_pass"]["seconds"])
+    for name, error in report["compressed"]["error"]["on_sphere"].items():
+        if name != "total":
+            assert error == pytest.approx(report["meshes"][name]["two_pass"]["error"], rel=1e-3)
+    assert 0 < report["image"] < 0.05
+    for name in ("clusters", "compressed"):
+        assert np.ptp(matplotlib.image.imread(tmp_path / f"{name}.png")) > 0.1
+    assert "ball" in printed(cpca_tables(report))
+
+
+def test_glossy(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Brute force is slower than finite elements, and takes its direct light from the same rays."""
+    for name, value in (("IMAGE_SPP", 8), ("IMAGE_WIDTH", 48), ("SPP", 4), ("ROWS", 8)):
+        monkeypatch.setattr(glossy, name, value)
+    phong = {"type": "phong", "exponent": 20.0, "diffuse_reflectance": {"type": "rgb", "value": 0.2}}
+    with pytest.warns(prt.PrtWarning, match="not diffuse"):
+        scene = tiny(phong)
+    report = glossy.measure_glossy(scene, prt.CubemapLighting(4), False, tmp_path)
+    json.dumps(report)
+    seconds, ratios = report["seconds"], report["ratios"]
+    assert ratios["glossy_over_diffuse"] == pytest.approx(seconds["glossy"] / seconds["diffuse"])
+    assert ratios["brute_force_over_glossy"] == pytest.approx(seconds["brute_force"] / seconds["glossy"])
+    (factors,) = report["factors"]
+    assert factors["mesh"] == "ball"
+    assert factors["whole"] == sorted(factors["whole"], reverse=True)
+    assert {image["environment"] for image in report["images"]["images"]} == {"own", "studio"}
+    assert np.ptp(matplotlib.image.imread(tmp_path / "factors_0.png")) > 0.1
+    assert "ball" in printed(glossy_tables(report))
+
+
+def test_a_diffuse_copy_has_the_same_vertices() -> None:
+    with pytest.warns(prt.PrtWarning, match="not diffuse"):
+        scene = tiny({"type": "roughplastic", "alpha": 0.3})
+    copy = glossy.diffuse_copy(scene)
+    np.testing.assert_allclose(copy.positions, scene.positions, atol=1e-6)
+    np.testing.assert_allclose(copy.normals, scene.normals, atol=1e-5)
+    assert copy.diffuse
+    ball = scene.meshes[0].vertices
+    np.testing.assert_allclose(copy.albedo[ball].mean(axis=0), scene.albedo[ball].mean(axis=0), rtol=1e-3)
