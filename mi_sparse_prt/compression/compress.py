@@ -97,7 +97,7 @@ def compress(
         "bases": part.bases.shape[1],
         "error": errors | {"on_sphere": _errors(transport, [(mesh.left[-1], mesh.energy) for mesh in found])},
         "nbytes": compressed.nbytes,
-        "ratio": 4 * part.coefficients[..., 0].size * part.lighting.n_directions / compressed.nbytes,
+        "ratio": 4 * np.prod(part.coefficients.shape[:2]) * part.lighting.n_directions / compressed.nbytes,
         "seconds": clock.report(),
     }
     return compressed

@@ -34,11 +34,11 @@ def computed(grey_scene: Scene) -> LightTransport:
     return prt.precompute(grey_scene, prt.CubemapLighting(8), method="gather", progress=False)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_errors_are_those_of_the_rows(form: str) -> None:
+@pytest.mark.parametrize(("form", "bases"), [*((form, 4) for form in FORMS), ("bits", 0)])
+def test_errors_are_those_of_the_rows(form: str, bases: int) -> None:
     """``error`` is what an expanded matrix has, 16-bit numbers included; so is that on the sphere."""
     transport = made_up(form)
-    compressed = prt.compress(transport, clusters=3, bases=4, progress=False)
+    compressed = prt.compress(transport, clusters=3, bases=bases, progress=False)
     report = compressed.report["compression"]
     truth, ours = every_row(transport), every_row(compressed)
     assert report["error"]["total"] == pytest.approx(relative(ours, truth), rel=2e-3)
