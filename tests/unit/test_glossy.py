@@ -37,6 +37,12 @@ def glossy(scene: Scene) -> GlossyTransport:
     return prt.precompute_glossy(scene, prt.CubemapLighting(8), terms=3, progress=False)
 
 
+@pytest.fixture(scope="module")
+def coarse(scene: Scene) -> GlossyTransport:
+    """Of so few directions that a basis of all is small."""
+    return prt.precompute_glossy(scene, prt.CubemapLighting(2), terms=3, progress=False)
+
+
 def every_row(glossy: GlossyTransport) -> np.ndarray:
     return glossy.white_rows(np.arange(glossy.direct.count))
 
@@ -119,11 +125,10 @@ def test_rows_of_a_vertex_share_its_cluster(scene: Scene, glossy: GlossyTranspor
     ours, truth = (t.relight(light, toward) for t in (small, glossy))
     assert np.linalg.norm(ours - truth) < 0.02 * np.linalg.norm(truth)
     assert small.report["compression"]["error"]["total"] < 0.2
-    exact = prt.compress(glossy, clusters=1, bases=400, progress=False)
-    assert np.linalg.norm(exact.relight(light, toward) - truth) < 2e-3 * np.linalg.norm(truth)
 
 
-def test_a_compressed_transport_is_rendered(scene: Scene, glossy: GlossyTransport) -> None:
+def test_a_compressed_transport_is_rendered(scene: Scene, coarse: GlossyTransport) -> None:
+    """With all basis vectors there are it is the same picture, but for 16 bits."""
     sensor = mi.load_dict(
         {
             "type": "perspective",
@@ -131,9 +136,9 @@ def test_a_compressed_transport_is_rendered(scene: Scene, glossy: GlossyTranspor
             "film": {"type": "hdrfilm", "width": 32, "height": 24},
         }
     )
-    light = np.ones((glossy.lighting.n_directions, 3), np.float32)
-    exact = prt.compress(glossy, clusters=1, bases=400, progress=False)
-    images = [render(scene, t, light, sensor, spp=4) for t in (glossy, exact)]
+    light = np.random.default_rng(2).random((coarse.lighting.n_directions, 3)).astype(np.float32)
+    exact = prt.compress(coarse, clusters=1, bases=24, progress=False)
+    images = [render(scene, t, light, sensor, spp=4) for t in (coarse, exact)]
     assert np.linalg.norm(images[0] - images[1]) < 2e-3 * np.linalg.norm(images[0])
 
 
