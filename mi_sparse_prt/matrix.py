@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.bits import BITS
 from mi_sparse_prt.blocks import in_blocks, rows_times
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment

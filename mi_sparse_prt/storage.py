@@ -19,7 +19,7 @@ import zarr
 from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import BITS
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.fractional_visibility import FractionalVisibility

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene import Scene

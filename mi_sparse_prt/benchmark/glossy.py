@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import numpy as np
 from mi_sparse_prt.benchmark.factor_pictures import factor_picture
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.environment import load_environment
-from mi_sparse_prt.errors import PrtWarning
+from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
 from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.measurement.brdf_factors import factor_error
@@ -28,6 +26,7 @@ from mi_sparse_prt.validation.glossy import validate_glossy, with_bsdf
 SPP = 16  # of brute force
 ROWS = 64  # vertices that brute force is timed at
 IMAGE_SPP, IMAGE_WIDTH = 512, 320
+STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
 REPEATS = 2  # of which the second counts: all is compiled then
 EVALUATION = (
     "setup",
@@ -62,7 +61,6 @@ def measure_glossy(
         from some vertices, whose paths are shared by all terms; ``ratios`` of these. ``factors``: held-out errors of
         each BRDF. ``images``: what ``validate_glossy`` reports, under the scene's environment and another.
     """
-    warnings.simplefilter("ignore", PrtWarning)
     plan = Plan("exact", "gather", rays=RAYS, tolerance=TOLERANCE)
     dull = diffuse_copy(scene)
     for _ in range(REPEATS):
@@ -76,11 +74,7 @@ def measure_glossy(
         "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
         "brute_force": brute,
     }
-    environment = scene.mitsuba.environment()
-    other = load_environment(Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr")
-    images = validate_glossy(
-        scene, transport, {"own": environment, "studio": other}, spp=IMAGE_SPP, width=IMAGE_WIDTH
-    )
+    images = validate_glossy(scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH)
     if figures is not None:
         images.save(figures)
         for number, factors in enumerate(transport.factors):
@@ -98,6 +92,14 @@ def measure_glossy(
         "factors": _factor_errors(scene, transport),
         "images": images.report,
     }
+
+
+def _environments(scene: Scene) -> dict[str, Environment | mi.Emitter]:
+    """The scene's own, and small lights, where the file is: it does not come with an installed package."""
+    found: dict[str, Environment | mi.Emitter] = {"own": scene.mitsuba.environment()}
+    if STUDIO.is_file():
+        found["studio"] = load_environment(STUDIO)
+    return found
 
 
 def diffuse_copy(scene: Scene) -> Scene:

@@ -250,9 +250,8 @@ class _Spaces:
         some -= np.concatenate([along, one], axis=2) @ np.concatenate([basis, mean[None]])
         errors, left_out = _squares(some, self._squared_scale)
         kept = np.square(along, dtype=np.float64).sum(axis=1)[:, ::-1]  # [vertex, vector], the last one first
-        more = np.cumsum(np.column_stack([errors.sum(axis=1), kept]), axis=1)[
-            :, ::-1
-        ]  # [vertex, vectors that count]
+        parts = np.column_stack([errors.sum(axis=1), kept])
+        more = np.cumsum(parts, axis=1)[:, ::-1]  # [vertex, vectors that count]
         rest = weights @ squares.sum(axis=1), (shades * left_out).sum(), (shades * norms).sum()
         return np.concatenate([weights @ more, rest])
 

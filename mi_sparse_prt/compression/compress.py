@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.compressed_parts import Clustered
 from mi_sparse_prt.compression.clustered import MeshClusters, clustered_mesh, mesh_rows
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.compression.truncation import TARGET, haar_part
 from mi_sparse_prt.cost import Stopwatch

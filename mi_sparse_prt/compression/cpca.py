@@ -295,7 +295,7 @@ def nearest_clusters(rows: Floats, clusters: Clusters, count: int) -> Indices:
     k, b = clusters.bases.shape[:2]
     spaces = np.concatenate([clusters.means[:, None], clusters.bases], axis=1).reshape(-1, m).T
     offsets = _offsets(clusters)
-    nearest = np.empty((n, min(count, k)), np.int64)
+    nearest = np.zeros((n, min(count, k)), np.int64)  # of rows that are NaN no distance is the least
     step = max(1, BLOCK // (g * k * (b + 1)))
     for a in range(0, n, step):
         products = (rows[a : a + step].reshape(-1, m) @ spaces).reshape(-1, g, k, b + 1)

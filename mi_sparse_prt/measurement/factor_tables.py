@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,30 @@ def outgoing_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Float
         values = np.moveaxis(m.grid.interpolated(m.outgoing, every), 2, 0)  # [direction, term, channel]
         found.append(np.broadcast_to(values, (*values.shape[:2], 3)).reshape(size, size, -1, 3))
     return _stacked(found)
+
+
+def looked_up(
+    table: mi.Float, size: int, terms: int, material: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
+) -> list[mi.Float]:
+    """Values (terms) of tables (materials, size, size, terms), flattened, in directions of their frames; bilinear."""
+    half = 0.5 * (size - 1)
+    scale = half / (1 + dr.maximum(local.z, 0))
+    a, b = dr.fma(local.x, scale, half), dr.fma(local.y, scale, half)
+    column, row = (mi.UInt32(dr.clip(x, 0, size - 1.001)) for x in (a, b))
+    a, b = a - column, b - row
+    first = (material * size + row) * size + column
+    found = []
+    for k in range(terms):
+        total = mi.Float(0)
+        for step, weight in (
+            (0, (1 - a) * (1 - b)),
+            (1, a * (1 - b)),
+            (size, (1 - a) * b),
+            (size + 1, a * b),
+        ):
+            total += weight * dr.gather(mi.Float, table, (first + step) * terms + k, valid)
+        found.append(total)
+    return found
 
 
 def _stacked(tables: list[NDArray[np.floating]]) -> Floats:

@@ -9,8 +9,7 @@ import numpy as np
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, diffuse_reflectance
 from mi_sparse_prt.measurement.brdf_factors.parts import SLANTED
-from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
-from mi_sparse_prt.transport.glossy_gather import looked_up
+from mi_sparse_prt.measurement.factor_tables import incident_tables, looked_up, outgoing_tables
 
 LOBE = 10.0  # exponent of the lobe that is sampled: wider than most that few factors can tell
 LOBE_SHARE = 0.5  # of the samples; the others are cosine-distributed

@@ -15,10 +15,9 @@ from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.measurement.factor_tables import outgoing_tables
+from mi_sparse_prt.measurement.factor_tables import looked_up, outgoing_tables
 from mi_sparse_prt.plugins.factored import VaryingDiffuse
 from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.glossy_gather import looked_up
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart

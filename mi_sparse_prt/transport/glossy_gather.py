@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import Factored, Part
+from mi_sparse_prt.measurement.factor_tables import looked_up
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.contacts import contacts
@@ -168,30 +169,6 @@ class Lobes:
     ) -> list[mi.Float]:
         material = dr.gather(mi.UInt32, self._material, vertex, valid)
         return looked_up(table, self._size, self._terms, material, local, valid)
-
-
-def looked_up(
-    table: mi.Float, size: int, terms: int, material: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
-) -> list[mi.Float]:
-    """Values (terms) of tables (materials, size, size, terms), flattened, in directions of their frames; bilinear."""
-    half = 0.5 * (size - 1)
-    scale = half / (1 + dr.maximum(local.z, 0))
-    a, b = dr.fma(local.x, scale, half), dr.fma(local.y, scale, half)
-    column, row = (mi.UInt32(dr.clip(x, 0, size - 1.001)) for x in (a, b))
-    a, b = a - column, b - row
-    first = (material * size + row) * size + column
-    found = []
-    for k in range(terms):
-        total = mi.Float(0)
-        for step, weight in (
-            (0, (1 - a) * (1 - b)),
-            (1, a * (1 - b)),
-            (size, (1 - a) * b),
-            (size + 1, a * b),
-        ):
-            total += weight * dr.gather(mi.Float, table, (first + step) * terms + k, valid)
-        found.append(total)
-    return found
 
 
 def _with_dark(tables: Floats) -> mi.Float:

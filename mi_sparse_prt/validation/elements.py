@@ -7,7 +7,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.bits import bits_at
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.matrix import Factored, Indirect, Interpolated, MeanCosine, Visibility

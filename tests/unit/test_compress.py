@@ -9,9 +9,9 @@ import scipy.sparse
 from conftest import made_up
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compressed_parts import Clustered
 from mi_sparse_prt.compression import clustered
 from mi_sparse_prt.compression.clustered import finished, mesh_rows
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.compress import matrix_errors
 from mi_sparse_prt.compression.cpca import Clusters, settled, standard_cpca
 from mi_sparse_prt.matrix import Interpolated, LightTransport

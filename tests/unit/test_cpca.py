@@ -177,6 +177,13 @@ def test_degenerate_rows(n: int, distinct: int, rank: int, k: int, b: int, centr
             assert total(rows, equal(n), found) < 1e-6 * max(np.square(rows).sum(), 1e-30)
 
 
+def test_a_row_that_is_no_number_stays_among_the_clusters() -> None:
+    rows, _ = spaces(40, 2, 1, 6)
+    found = standard_cpca(rows, equal(40), 2, 1)
+    rows[3] = np.nan
+    assert set(nearest_clusters(rows, found, 2)[3]) <= {0, 1}
+
+
 def test_the_same_seed_gives_the_same_clusters() -> None:
     """Whatever the number of threads."""
     rows, _ = spaces(400, 5, 4, 30, noise=0.3)

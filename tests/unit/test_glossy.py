@@ -62,6 +62,8 @@ def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: GlossyT
         high = local[:, 2] > 0.1
         scale = np.abs(expected).max(axis=1, keepdims=True)
         assert (np.abs(found - expected)[:, high] < 0.02 * scale).all()
+        gain = (found * expected).sum(axis=1) / np.square(expected).sum(axis=1)
+        np.testing.assert_allclose(gain, 1, atol=4e-3)
 
 
 def test_all_ways_to_ask_agree(glossy: GlossyTransport) -> None:

@@ -9,7 +9,7 @@ from conftest import FORMS, build, diffuse, made_up, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compressed_parts import Clustered
+from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.haar import inverse_haar
 from mi_sparse_prt.fractional_visibility import FractionalVisibility, _means
