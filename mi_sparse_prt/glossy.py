@@ -7,6 +7,7 @@ indirect light is gathered by finite elements among white light and coefficients
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -21,11 +22,11 @@ from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.evaluation import Evaluation
 from mi_sparse_prt.glossy_parts import FactoredVisibility
 from mi_sparse_prt.matrix import Factored, MeshRange, Visibility
-from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, diffuse_reflectance, factors_of
+from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, anisotropic, diffuse_reflectance, factors_of
 from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
 from mi_sparse_prt.measurement.frames import beside_vertices, frames, vertex_tangents
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -38,6 +39,10 @@ TERMS = 4
 RAYS = 64
 TOLERANCE = 0.06  # of the first bounce, for its low rank
 
+NO_TANGENTS = (
+    "shape '{}': its BSDF is anisotropic and it has no texture coordinates: Mitsuba then takes the first edge of each "
+    "triangle for its tangent, which vertices cannot follow; give it texture coordinates"
+)
 EVEN = 1e-6  # relative difference of channels that is none
 
 Floats = NDArray[np.float32]
@@ -296,9 +301,11 @@ def factored_materials(scene: Scene, terms: int) -> tuple[NDArray[np.int64], lis
     material, known = np.full(scene.n_vertices, -1), dict[bytes, int]()
     factors: list[BrdfFactors] = []
     albedo, surface = scene.albedo.copy(), beside_vertices(scene)
-    for mesh, own in zip(scene.meshes, scene.materials, strict=True):
+    for mesh, own, shape in zip(scene.meshes, scene.materials, scene.mitsuba.shapes(), strict=True):
         if own.diffuse:
             continue
+        if not shape.has_vertex_texcoords() and anisotropic(own.bsdf, mesh.name):
+            warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=3)
         digest = own.digest()
         if digest not in known:
             known[digest] = len(factors)

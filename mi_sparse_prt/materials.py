@@ -29,6 +29,12 @@ SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 BUMPED = {"NormalMap", "BumpMap"}
 
 
+def kind(bsdf: mi.BSDF) -> str:
+    """The class of a BSDF, also of one that is written in Python."""
+    own = type(bsdf).__name__
+    return own if own != "BSDF" else str(bsdf.class_name())
+
+
 class Material:
     """A shape's BSDF, and what can be said about it.
 
@@ -62,7 +68,7 @@ class Material:
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {self.bsdf.class_name()} {what}; its vertices are treated as diffuse "
+                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; its vertices are treated as diffuse "
                 "with the same reflectance, indirect paths use the real BSDF"
             )
         if self._emitter is not None:

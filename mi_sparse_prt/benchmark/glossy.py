@@ -15,6 +15,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
 from mi_sparse_prt.glossy_parts import FactoredVisibility
+from mi_sparse_prt.materials import kind
 from mi_sparse_prt.measurement.brdf_factors import factor_error
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.planner.plan import Plan
@@ -140,7 +141,7 @@ def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
         found.append(
             {
                 "mesh": mesh.name,
-                "bsdf": material.bsdf.class_name(),
+                "bsdf": kind(material.bsdf),
                 "terms": factors.terms,
                 "whole": error.whole.tolist(),
                 "grazing": error.grazing.tolist(),

@@ -9,13 +9,14 @@ from .directions import DirectionGrid
 from .factors import MOST_TERMS, BrdfFactors, factor_brdf
 from .harmonics import harmonic_factors
 from .held_out import FactorError, factor_error
-from .parts import diffuse_reflectance, evaluated
+from .parts import anisotropic, diffuse_reflectance, evaluated
 
 __all__ = [
     "MOST_TERMS",
     "BrdfFactors",
     "DirectionGrid",
     "FactorError",
+    "anisotropic",
     "diffuse_reflectance",
     "evaluated",
     "factor_brdf",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.materials import kind
 
 from .directions import AZIMUTHS, HEIGHTS, DirectionGrid, Doubles, Floats
 
@@ -17,6 +18,8 @@ PROBES = 12  # outgoing directions for that, each with the mirrored, a nearby an
 LOWEST_PROBE = 0.3  # cosine
 SLANTED = (0.6, 0.0, 0.8)  # light that goes back where it came from: no highlight
 ROUNDING = 1e-5  # relative
+UNLIKE = 1e-2  # relative: what a turned BRDF differs by, tables and rounding apart
+TURNED = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]], np.float32)  # by 53 degrees
 
 
 class GlossyPart:
@@ -141,7 +144,7 @@ def _check(bsdf: mi.BSDF, name: str) -> bool:
             problem = "varies over the surface in more than a Lambertian reflectance"
     if problem:
         raise PrtError(
-            f"shape '{name}': BSDF {bsdf.class_name()} {problem}, which factors of a BRDF cannot; "
+            f"shape '{name}': BSDF {kind(bsdf)} {problem}, which factors of a BRDF cannot; "
             "use path tracing instead"
         )
     return varies
@@ -163,6 +166,14 @@ def _variation(bsdf: mi.BSDF, name: str) -> tuple[bool, bool]:
     dullest = int(np.argmin(rounding))
     alike = np.abs(change - change[:, [dullest]]) <= rounding + rounding[dullest]
     return bool((np.abs(change) > rounding).any()), bool(alike.all())
+
+
+def anisotropic(bsdf: mi.BSDF, name: str) -> bool:
+    """Whether a BRDF changes when both directions are turned about the normal."""
+    incident, outgoing = probes()
+    value = evaluated(bsdf, name, incident, outgoing)
+    turned = evaluated(bsdf, name, incident @ TURNED, outgoing @ TURNED)
+    return bool((np.abs(turned - value) > UNLIKE * np.abs(value).max()).any())
 
 
 def probes() -> tuple[Floats, Floats]:
