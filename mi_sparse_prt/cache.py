@@ -6,12 +6,14 @@ import hashlib
 import json
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError, PrtWarning
+from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene import Scene
@@ -44,18 +46,54 @@ def cached_precompute(
         As for ``precompute``. Together with the scene's hash they are the key of the file; the order of the scene's
         shapes is not part of it.
     """
-    key = json.dumps([VERSION, scene.hash, asdict(Settings(lighting.resolution, **settings))], sort_keys=True)
-    folder = folder or default_folder()
+    what = asdict(Settings(lighting.resolution, **settings))
+    found = _cached(
+        scene,
+        what,
+        folder or default_folder(),
+        lambda kept: precompute(scene, lighting, progress=progress, checkpoint_folder=kept, **settings),
+    )
+    assert isinstance(found, LightTransport)
+    return found
+
+
+def cached_glossy(
+    scene: Scene,
+    lighting: CubemapLighting,
+    folder: Path | None = None,
+    progress: bool = True,
+    **settings: Any,
+) -> GlossyTransport:
+    """``precompute_glossy``, or the transport that an earlier call left in a folder; as ``cached_precompute``."""
+    what = {"glossy": lighting.resolution, **settings}
+    found = _cached(
+        scene,
+        what,
+        folder or default_folder(),
+        lambda _: precompute_glossy(scene, lighting, progress=progress, **settings),
+    )
+    assert isinstance(found, GlossyTransport)
+    return found
+
+
+def _cached(
+    scene: Scene,
+    what: dict[str, Any],
+    folder: Path,
+    make: Callable[[Path], LightTransport | GlossyTransport],
+) -> LightTransport | GlossyTransport:
+    """What a scene and JSON-able settings lead to, from a file of the folder or made, given the folder, and kept."""
+    key = json.dumps([VERSION, scene.hash, what], sort_keys=True)
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.prt"
     if path.exists():
         try:
             return load_transport(path, scene)
         except PrtError as error:
-            warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
-    transport = precompute(scene, lighting, progress=progress, checkpoint_folder=folder, **settings)
+            warnings.warn(f"cache: {error}", PrtWarning, stacklevel=3)
+    transport = make(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         transport.save(path)
     except (OSError, PrtError) as error:  # the result is good, only not kept
-        warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
+        warnings.warn(f"cache: {error}", PrtWarning, stacklevel=3)
     return transport

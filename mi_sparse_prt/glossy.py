@@ -8,8 +8,9 @@ indirect light is gathered by finite elements among white light and coefficients
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -25,8 +26,14 @@ from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.evaluation import Evaluation
 from mi_sparse_prt.glossy_parts import FactoredVisibility
-from mi_sparse_prt.matrix import Factored, MeshRange, Visibility
-from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, anisotropic, diffuse_reflectance, factors_of
+from mi_sparse_prt.matrix import Factored, MeshRange, Visibility, row_order
+from mi_sparse_prt.measurement.brdf_factors import (
+    BrdfFactors,
+    anisotropic,
+    diffuse_reflectance,
+    factors_of,
+    harmonic_factors,
+)
 from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
 from mi_sparse_prt.measurement.frames import beside_vertices, frames, vertex_tangents
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -129,6 +136,70 @@ class GlossyTransport:
         found = rows_times(lambda some: self.direct.rows(ids[some]), len(ids), vectors)
         return found if self.indirect is None else found + self.indirect.reordered(ids).project(vectors)
 
+    def for_scene(self, scene: Scene) -> GlossyTransport:
+        """The same transport with its rows in the order of a scene's vertices, as ``LightTransport.for_scene``."""
+        source = row_order(self.scene_hash, self.vertex_keys, scene)
+        if source is None:
+            return self
+        n = len(self.albedo)
+        terms = np.searchsorted(self.glossy, source[self.material[source] >= 0])[:, None] * self.terms
+        rows = np.concatenate([source, (n + terms + np.arange(self.terms)).ravel()])
+        bits = isinstance(self.direct, FactoredVisibility)
+        return replace(
+            self,
+            albedo=self.albedo[source],
+            areas=self.areas[source],
+            direct=self.direct.reordered(source if bits else rows),
+            indirect=self.indirect and self.indirect.reordered(rows),
+            tangents=self.tangents[source],
+            normals=self.normals[source],
+            material=self.material[source],
+            meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+            vertex_keys=self.vertex_keys[source],
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the transport to one file (see ``storage.save``)."""
+        from mi_sparse_prt.storage import save
+
+        save(self, path)
+
+    def with_bsdf(self, mesh: str, bsdf: mi.BSDF) -> GlossyTransport:
+        """The transport with another BSDF on a glossy mesh; nothing is traced.
+
+        Parameters
+        ----------
+        mesh : str
+            Its name.
+        bsdf : mi.BSDF
+
+        Returns
+        -------
+        GlossyTransport
+            Of the same vertices; rendered with the same scene. Light that this mesh sends to others remains that of the
+            old BSDF, all that leaves it towards a camera is of the new one.
+
+        Raises
+        ------
+        PrtError
+            If the transport was not made with ``harmonics``, whose terms serve any BSDF, if there is no such glossy
+            mesh, or if the BSDF cannot be factored or its diffuse part varies over the surface.
+        """
+        order = self.report["parameters"]["harmonics"]
+        if order is None:
+            raise PrtError(
+                "these terms are of their own BRDFs; precompute them with harmonics=3 to choose later"
+            )
+        known = {m.name: m.vertices for m in self.meshes if self.material[m.vertices.start] >= 0}
+        if mesh not in known:
+            raise PrtError(f"{mesh!r} is no glossy mesh of this transport; it has: {', '.join(known)}")
+        factors = harmonic_factors(bsdf, mesh, order)
+        if factors.varying_diffuse:
+            raise PrtError(f"shape '{mesh}': the new BSDF has a texture; give one that is the same all over")
+        material, albedo = self.material.copy(), self.albedo.copy()
+        material[known[mesh]], albedo[known[mesh]] = len(self.factors), factors.diffuse
+        return replace(self, material=material, albedo=albedo, factors=(*self.factors, factors))
+
     def term_numbers(self, vertices: slice) -> tuple[NDArray[np.int64], Floats]:
         """Rows of the terms of one mesh's vertices (n, K), and the mean squares of g_k over views (K, 3).
 
@@ -179,6 +250,7 @@ def precompute_glossy(
     scene: Scene,
     lighting: CubemapLighting,
     terms: int = TERMS,
+    harmonics: int | None = None,
     direct: str = "exact",
     max_depth: int = 5,
     rays: int = RAYS,
@@ -196,6 +268,9 @@ def precompute_glossy(
         The direction basis is used.
     terms : int
         K, of each BRDF.
+    harmonics : int, optional
+        Spherical harmonics up to this order instead of each BRDF's own incident factors: (order + 1)^2 terms, which
+        serve any BRDF (``GlossyTransport.with_bsdf``).
     direct : {"exact", "consensus"}
         How visibility is found, once for all terms.
     max_depth : int
@@ -212,7 +287,7 @@ def precompute_glossy(
     -------
     GlossyTransport
         With ``report``: ``seconds`` per phase, ``rays``, ``ranks``, ``glossy_vertices``, ``peak_memory_bytes``,
-        ``seed``, ``parameters``, ``versions``.
+        ``seed``, ``scene``, ``parameters``, ``versions``.
 
     Raises
     ------
@@ -227,7 +302,7 @@ def precompute_glossy(
         points = vertex_points(scene)
         solver = DirectTransport(scene.normalised, lighting, points, "direction", 2, seed)
     with clock.phase("factors"):
-        material, factors, albedo = factored_materials(scene, terms)
+        material, factors, albedo = factored_materials(scene, terms, harmonics)
         tangents = vertex_tangents(scene)
     light = Evaluation(scene, solver, settings, max_depth != 2, clock, progress).direct_light(direct)
     assert isinstance(light.direct, Visibility)
@@ -249,12 +324,14 @@ def precompute_glossy(
     report = {
         "seconds": clock.report(),
         "rays": light.rays | ({} if indirect is None else {"gather": len(points) * rays}),
-        "ranks": () if indirect is None else indirect.ranks,
+        "ranks": [] if indirect is None else list(indirect.ranks),
         "glossy_vertices": len(glossy),
         "peak_memory_bytes": peak_memory(),
         "seed": seed,
+        "scene": scene.summary,
         "parameters": {
-            "terms": terms,
+            "terms": factors[0].terms,
+            "harmonics": harmonics,
             "direct": direct,
             "max_depth": max_depth,
             "rays": rays,
@@ -286,7 +363,9 @@ def _check(terms: int, direct: str) -> None:
         raise PrtError(f"direct {direct!r} is neither 'exact' nor 'consensus'")
 
 
-def factored_materials(scene: Scene, terms: int) -> tuple[NDArray[np.int64], list[BrdfFactors], Floats]:
+def factored_materials(
+    scene: Scene, terms: int, harmonics: int | None = None
+) -> tuple[NDArray[np.int64], list[BrdfFactors], Floats]:
     """What BRDFs vertices have.
 
     Returns
@@ -309,7 +388,11 @@ def factored_materials(scene: Scene, terms: int) -> tuple[NDArray[np.int64], lis
         digest = own.digest()
         if digest not in known:
             known[digest] = len(factors)
-            factors.append(factors_of(own.bsdf, mesh.name, terms))
+            factors.append(
+                factors_of(own.bsdf, mesh.name, terms)
+                if harmonics is None
+                else harmonic_factors(own.bsdf, mesh.name, harmonics)
+            )
         material[mesh.vertices] = known[digest]
         found = factors[known[digest]]
         albedo[mesh.vertices] = found.diffuse

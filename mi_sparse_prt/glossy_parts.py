@@ -114,6 +114,20 @@ class FactoredVisibility:
             [self.white.relight(lighting), _relit(self.bits, *own, directions, power).reshape(-1, 3)]
         )
 
+    def reordered(self, source: Rows) -> FactoredVisibility:
+        """The part of other vertices: ``source`` numbers those of this one, each at most once."""
+        number = np.full(len(self.bits), -1)
+        number[self.glossy] = np.arange(len(self.glossy))
+        kept = number[source][number[source] >= 0]
+        return replace(
+            self,
+            bits=self.bits[source],
+            normals=self.normals[source],
+            glossy=np.flatnonzero(number[source] >= 0),
+            frames=self.frames[kept],
+            materials=self.materials[kept],
+        )
+
     def project(self, vectors: Floats) -> Floats:
         return rows_times(self.rows, self.count, vectors)
 

@@ -68,8 +68,8 @@ class Material:
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; its vertices are treated as diffuse "
-                "with the same reflectance, indirect paths use the real BSDF"
+                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; matrices treat its vertices as diffuse "
+                "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
             )
         if self._emitter is not None:
             notes.append(f"shape '{name}' is an area emitter: it does not take part in the transport matrix")

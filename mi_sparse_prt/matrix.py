@@ -448,19 +448,9 @@ class LightTransport:
         PrtError
             If the matrix belongs to another scene.
         """
-        if scene.hash != self.scene_hash:
-            raise PrtError(
-                f"this matrix belongs to another scene than {scene.path or 'the one given'} "
-                "(geometry or materials differ); precompute it again"
-            )
-        keys = vertex_points(scene).keys
-        if np.array_equal(self.vertex_keys, keys):
+        source = row_order(self.scene_hash, self.vertex_keys, scene)
+        if source is None:
             return self
-        ours, theirs = (np.argsort(k, kind="stable") for k in (self.vertex_keys, keys))
-        if not np.array_equal(self.vertex_keys[ours], keys[theirs]):
-            raise PrtError("this matrix belongs to other vertices of the same scene; precompute it again")
-        source = np.empty_like(ours)
-        source[theirs] = ours
         return replace(
             self,
             albedo=self.albedo[source],
@@ -468,7 +458,7 @@ class LightTransport:
             direct=self.direct.reordered(source),
             indirect=self.indirect and self.indirect.reordered(source),
             meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-            vertex_keys=keys,
+            vertex_keys=self.vertex_keys[source],
         )
 
     def save(self, path: str | Path) -> None:
@@ -487,6 +477,30 @@ class LightTransport:
 
     def _parts(self) -> list[StoredPart]:
         return [self.direct] if self.indirect is None else [self.direct, self.indirect]
+
+
+def row_order(scene_hash: str, vertex_keys: NDArray[np.uint64], scene: Scene) -> NDArray[np.int64] | None:
+    """Where a matrix has the vertices of a scene, (n_v,); None if they come in the same order.
+
+    Raises
+    ------
+    PrtError
+        If the matrix belongs to another scene.
+    """
+    if scene.hash != scene_hash:
+        raise PrtError(
+            f"this matrix belongs to another scene than {scene.path or 'the one given'} "
+            "(geometry or materials differ); precompute it again"
+        )
+    keys = vertex_points(scene).keys
+    if np.array_equal(vertex_keys, keys):
+        return None
+    ours, theirs = (np.argsort(k, kind="stable") for k in (vertex_keys, keys))
+    if not np.array_equal(vertex_keys[ours], keys[theirs]):
+        raise PrtError("this matrix belongs to other vertices of the same scene; precompute it again")
+    source = np.empty_like(ours)
+    source[theirs] = ours
+    return source
 
 
 def _checked(ids: ArrayLike, count: int, what: str) -> Rows:

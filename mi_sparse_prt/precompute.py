@@ -277,12 +277,7 @@ def _inputs(scene: Scene, settings: Settings) -> dict[str, Any]:
     return {
         "seed": settings.seed,
         "parameters": asdict(replace(settings, indirect_resolution=settings.coarse.resolution)),
-        "scene": {
-            "path": scene.path,
-            "hash": scene.hash,
-            "vertices": len(scene.positions),
-            "warnings": scene.warnings,
-        },
+        "scene": scene.summary,
         "versions": versions(),
     }
 

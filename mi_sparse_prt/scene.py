@@ -251,6 +251,16 @@ class Scene:
         parts = [total.tobytes(), str(count).encode(), *sorted(digests)]
         return hashlib.sha256(b"|".join(parts)).hexdigest()
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What reports say of it; JSON as it is."""
+        return {
+            "path": self.path,
+            "hash": self.hash,
+            "vertices": self.n_vertices,
+            "warnings": self.warnings,
+        }
+
     def __repr__(self) -> str:
         names = ", ".join(f"{m.name} {m.vertices.stop - m.vertices.start}" for m in self.meshes)
         return f"Scene({self.n_vertices} vertices: {names})"

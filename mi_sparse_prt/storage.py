@@ -24,6 +24,14 @@ from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.glossy import GlossyTransport
+from mi_sparse_prt.glossy_storage import (
+    factor_attributes,
+    glossy_arrays,
+    read_factors,
+    read_glossy,
+    row_count,
+)
 from mi_sparse_prt.matrix import (
     Factored,
     Indirect,
@@ -35,7 +43,7 @@ from mi_sparse_prt.matrix import (
 )
 
 FORMAT = "mi_sparse_prt light transport matrix"
-VERSION = 5
+VERSION = 6
 _VERTEX_CHUNK = 4096  # rows
 _LIST_CHUNK = 1 << 20  # numbers of a plain list
 # what Zarr, zip and our own assembly raise when a file is not what it should be
@@ -51,12 +59,12 @@ _DAMAGE = (
 )
 
 
-def save(transport: LightTransport, path: str | Path) -> None:
+def save(transport: LightTransport | GlossyTransport, path: str | Path) -> None:
     """Write a matrix to a file; an interrupted or failed write leaves nothing under the name.
 
     Parameters
     ----------
-    transport : LightTransport
+    transport : LightTransport or GlossyTransport
     path : path
         By convention ``*.prt``.
 
@@ -88,7 +96,7 @@ def save(transport: LightTransport, path: str | Path) -> None:
             Path(temporary).unlink(missing_ok=True)
 
 
-def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
+def load_transport(path: str | Path, scene: Any = None) -> LightTransport | GlossyTransport:
     """Read a matrix from a file.
 
     Parameters
@@ -96,6 +104,11 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport:
     path : path
     scene : Scene, optional
         The scene it should belong to; a matrix of another scene is refused. Rows come in this scene's vertex order.
+
+    Returns
+    -------
+    LightTransport or GlossyTransport
+        Whichever was saved.
 
     Raises
     ------
@@ -134,17 +147,20 @@ def _umask() -> int:
     return mask
 
 
-def _write(transport: LightTransport, path: str) -> None:
-    attributes = {
+def _write(transport: LightTransport | GlossyTransport, path: str) -> None:
+    attributes: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
         "resolution": transport.lighting.resolution,
-        "basis": transport.basis,
         "scene_hash": transport.scene_hash,
         "meshes": [[m.name, m.vertices.start, m.vertices.stop] for m in transport.meshes],
         "indirect": transport.indirect is not None,
         "report": transport.report,
     }
+    if isinstance(transport, GlossyTransport):
+        attributes["factors"] = factor_attributes(transport.factors)
+    else:
+        attributes["basis"] = transport.basis
     store = zarr.storage.ZipStore(path, mode="w")
     try:
         group = zarr.create_group(store, attributes=attributes)
@@ -156,12 +172,14 @@ def _write(transport: LightTransport, path: str) -> None:
         store.close()
 
 
-def _arrays(transport: LightTransport) -> dict[str, NDArray[Any]]:
+def _arrays(transport: LightTransport | GlossyTransport) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {
         "albedo": transport.albedo,
         "areas": transport.areas,
         "vertex_keys": transport.vertex_keys,
     }
+    if isinstance(transport, GlossyTransport):
+        arrays |= glossy_arrays(transport)
     direct, indirect = transport.direct, transport.indirect
     if isinstance(direct, Interpolated):
         arrays |= _sparse_arrays("weights_direct", direct.weights)
@@ -208,9 +226,17 @@ def _read(array: Any) -> NDArray[Any]:
     return np.asarray(array[...])
 
 
-def _assemble(attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LightTransport:
+def _assemble(
+    attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]
+) -> LightTransport | GlossyTransport:
     lighting = CubemapLighting(attributes["resolution"])
-    _check_shapes(arrays, lighting)
+    if "factors" in attributes:
+        factors = read_factors(attributes["factors"], arrays)
+        _check_shapes(arrays, lighting, row_count(factors, arrays["material"]))
+        compressed = _clustered(arrays, lighting) if "cluster_labels" in arrays else None
+        indirect = _factored(arrays) if attributes["indirect"] else None
+        return read_glossy(attributes, arrays, lighting, factors, compressed, indirect)
+    _check_shapes(arrays, lighting, len(arrays["albedo"]))
     return LightTransport(
         lighting=lighting,
         basis=attributes["basis"],
@@ -285,12 +311,7 @@ def _indirect(
     arrays: dict[str, NDArray[Any]], lighting: CubemapLighting
 ) -> Indirect | Interpolated | Factored:
     if "left_0" in arrays:
-        left, right = (
-            [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
-        )
-        if len(left) not in (1, 3) or [a.shape[1] for a in left] != [b.shape[0] for b in right]:
-            raise ValueError("factors of the indirect light do not fit together")
-        return Factored(tuple(left), tuple(right))
+        return _factored(arrays)
     density = arrays["indirect"]
     indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
     if "weights_indirect_data" in arrays:
@@ -298,8 +319,17 @@ def _indirect(
     return indirect
 
 
-def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) -> None:
-    """All arrays are of the same vertices and of the file's lighting."""
+def _factored(arrays: dict[str, NDArray[Any]]) -> Factored:
+    left, right = (
+        [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
+    )
+    if len(left) not in (1, 3) or [a.shape[1] for a in left] != [b.shape[0] for b in right]:
+        raise ValueError("factors of the indirect light do not fit together")
+    return Factored(tuple(left), tuple(right))
+
+
+def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting, rows: int) -> None:
+    """All arrays are of the same vertices, or of all rows, and of the file's lighting."""
     n, m = len(arrays["albedo"]), lighting.n_directions
     # an interpolated part has fewer rows than the matrix, and weights with a row for each vertex
     n_direct = len(arrays["normals"]) if "weights_direct_indptr" in arrays else n
@@ -314,13 +344,13 @@ def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting) ->
         "share_starts": (n + 1,),
         "indirect": (n_indirect, *arrays["indirect"].shape[1:]) if "indirect" in arrays else (),
         "upsampling_indptr": (m + 1,),
-        "cluster_labels": (n,),
+        "cluster_labels": (rows,),
         "weights_direct_indptr": (n + 1,),
         "weights_indirect_indptr": (n + 1,),
     }
     for name, array in arrays.items():
         if name.startswith("left_") or name in ("cluster_coefficients", "haar_scales"):
-            expected[name] = (n, *array.shape[1:])
+            expected[name] = (rows, *array.shape[1:])
         elif name.startswith("right_") or name in ("cluster_means", "cluster_bases"):
             expected[name] = (*array.shape[:-1], m)
     for name, shape in expected.items():

@@ -13,10 +13,10 @@ from mi_sparse_prt.benchmark.cpca_pictures import cluster_picture, relit_picture
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.benchmark.reference import MAX_DEPTH
 from mi_sparse_prt.compression.clustered import SphereRows, clustered_mesh, mesh_rows
-from mi_sparse_prt.compression.compress import compress, default_clusters
+from mi_sparse_prt.compression.compress import AnyTransport, compress, default_clusters
 from mi_sparse_prt.compression.cpca import Clusters, squared_distances, standard_cpca
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.glossy import precompute_glossy
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene import Scene
@@ -36,6 +36,8 @@ def measure_cpca(
 ) -> Report:
     """Compress the matrix of a scene in both ways, with as many clusters, basis vectors and iterations.
 
+    Where surfaces are glossy, it has the terms of their BRDFs.
+
     Parameters
     ----------
     scene : Scene
@@ -53,11 +55,18 @@ def measure_cpca(
         ``compressed``: what ``compress`` reports of the whole; ``image``: relative L2 of a relit image against that of
         the uncompressed matrix.
     """
-    transport = precompute(scene, lighting, max_depth=MAX_DEPTH, target_error=TARGET, progress=progress)
+    if scene.diffuse:
+        matrix = precompute(scene, lighting, max_depth=MAX_DEPTH, target_error=TARGET, progress=progress)
+        return _both_ways(scene, matrix, progress, figures)
+    glossy = precompute_glossy(scene, lighting, max_depth=MAX_DEPTH, progress=progress)
+    return _both_ways(scene, glossy, progress, figures)
+
+
+def _both_ways(scene: Scene, transport: AnyTransport, progress: bool, figures: Path | None) -> Report:
     counts = CLUSTERS.get(Path(scene.path or "").stem) or default_clusters(transport)
     compressed = compress(transport, clusters=counts, bases=BASES, progress=progress)  # all is compiled then
     compressed = compress(transport, clusters=counts, bases=BASES, progress=progress)
-    report: Report = {**report_header(scene, lighting), "meshes": {}}
+    report: Report = {**report_header(scene, transport.lighting), "meshes": {}}
     for mesh in transport.meshes:
         report["meshes"][mesh.name] = _measured(mesh_rows(transport, mesh), counts[mesh.name])
     sums = {
@@ -99,7 +108,7 @@ def _error(rows: NDArray[np.float32], weights: NDArray[np.float32], found: Clust
 
 
 def _image_error(
-    scene: Scene, transport: LightTransport, compressed: LightTransport, figures: Path | None
+    scene: Scene, transport: AnyTransport, compressed: AnyTransport, figures: Path | None
 ) -> float | None:
     environment = scene.mitsuba.environment()
     if environment is None or not scene.mitsuba.sensors():

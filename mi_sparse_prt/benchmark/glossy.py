@@ -89,7 +89,7 @@ def measure_glossy(
             "glossy_over_diffuse": seconds["glossy"] / seconds["diffuse"],
             "brute_force_over_glossy": seconds["brute_force"] / seconds["glossy"],
         },
-        "ranks": list(transport.report["ranks"]),
+        "ranks": transport.report["ranks"],
         "factors": _factor_errors(scene, transport),
         "images": images.report,
     }

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.cli.files import image_bytes, npy_bytes, ply_bytes
@@ -19,6 +20,8 @@ from mi_sparse_prt.cli.tables import (
     benchmark_tables,
     choices_tables,
     cpca_tables,
+    glossy_images_table,
+    glossy_matrix_tables,
     glossy_tables,
     matrix_tables,
     methods_tables,
@@ -33,7 +36,11 @@ from mi_sparse_prt.cli.tables import (
 )
 from mi_sparse_prt.cost import Stopwatch
 from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.validation.glossy import GlossyValidation, validate_glossy
+from mi_sparse_prt.validation.validate import Validation
 from mi_sparse_prt.variant import VARIANTS
+
+AnyTransport = prt.LightTransport | prt.GlossyTransport
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -193,6 +200,14 @@ def precompute(
             show_default="auto: 0.02, and one try",
         ),
     ] = None,
+    terms: Annotated[
+        int | None,
+        typer.Option(
+            help="For glossy BSDFs: factors of each, 4 in [HR10]; images then depend on the view. Without, all "
+            "surfaces count as diffuse.",
+            show_default=False,
+        ),
+    ] = None,
     explain: Annotated[
         bool,
         typer.Option("--explain", help="Show all plans that auto compared, with predicted time and error."),
@@ -220,8 +235,20 @@ def precompute(
     Example: mi-sparse-prt precompute scenes_xml/bunny.xml -o bunny.prt
 
     A forecast of time and memory comes first; a table of what was done, skipped and how good it is comes last.
-    Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain.
+    Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain. Glossy surfaces: add --terms 4.
     """
+    asked = {
+        "--method": method is not Method.auto,
+        "--basis": basis is not Basis.direction,
+        "--spp": spp is not None,
+        "--indirect-resolution": indirect_resolution is not None,
+        "--target-error": target_error is not None,
+        "--explain": explain,
+        "--checkpoint": checkpoint is not None,
+    }
+    if terms is not None and any(asked.values()):
+        names = ", ".join(name for name, given in asked.items() if given)
+        raise typer.BadParameter(f"{names} has no meaning with it: leave one out", param_hint="--terms")
     with running(json_file, quiet, outputs=[output]) as command:
         parameters = _definitions(define)
         loaded = prt.load_scene(scene, edge_length, **parameters)
@@ -231,21 +258,32 @@ def precompute(
         coarse = indirect_resolution
         if coarse is None and method is Method.brute_force and target_error is None:
             coarse = min(8, resolution)
+        transport: AnyTransport
         with command.prompt_interrupts():
-            transport = prt.precompute(
-                loaded,
-                prt.CubemapLighting(resolution),
-                method=method.value,
-                basis=basis.value,
-                max_depth=max_depth,
-                spp=spp,
-                target_error=target_error,
-                seed=seed,
-                progress=not quiet,
-                indirect_resolution=coarse,
-                strata=strata,
-                checkpoint_folder=checkpoint,
-            )
+            if terms is not None:
+                transport = prt.precompute_glossy(
+                    loaded,
+                    prt.CubemapLighting(resolution),
+                    terms,
+                    max_depth=max_depth,
+                    seed=seed,
+                    progress=not quiet,
+                )
+            else:
+                transport = prt.precompute(
+                    loaded,
+                    prt.CubemapLighting(resolution),
+                    method=method.value,
+                    basis=basis.value,
+                    max_depth=max_depth,
+                    spp=spp,
+                    target_error=target_error,
+                    seed=seed,
+                    progress=not quiet,
+                    indirect_resolution=coarse,
+                    strata=strata,
+                    checkpoint_folder=checkpoint,
+                )
         # what `relight` needs to load the same scene again
         transport.report["scene"] |= {
             "path": str(scene.absolute()),
@@ -255,7 +293,7 @@ def precompute(
         transport.save(output)
         command.written.append(output)
         command.report = transport.report | {"file": {"path": str(output), "bytes": output.stat().st_size}}
-        command.show(*(plan_tables(transport) if explain else []), *matrix_tables(transport, output))
+        command.show(*_tables(transport, output, explain))
 
 
 @app.command()
@@ -328,8 +366,13 @@ def relight(
                 transport = prt.load_transport(matrix)
                 loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
             report["environment"] = light.report
-            with clock.phase("relight"):
-                radiance = transport.relight(light)  # [vertex, rgb]
+            if vertices is not None and isinstance(transport, prt.GlossyTransport):
+                raise PrtError(
+                    f"{matrix} has glossy surfaces, whose light depends on the view: give -o instead"
+                )
+            if isinstance(transport, prt.LightTransport):
+                with clock.phase("relight"):
+                    radiance = transport.relight(light)  # [vertex, rgb]
             if vertices is not None:
                 npy = vertices.suffix.lower() == ".npy"
                 files[vertices] = npy_bytes(radiance) if npy else ply_bytes(loaded, radiance)
@@ -378,29 +421,35 @@ def validate(
 
     Example: mi-sparse-prt validate scenes_xml/bunny.xml bunny.prt -o bunny_validation
 
-    Errors are relative L2; the reference's own noise is measured, reported beside them and not counted.
+    Errors are relative L2; the reference's own noise is measured, reported beside them and not counted. Of a matrix
+    with glossy surfaces, images from three cameras are compared, and errors split into their causes.
     """
     with running(json_file, quiet) as command:
         if output is not None:
             check_folder(output)
         transport = prt.load_transport(matrix)
         loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
+        result: Validation | GlossyValidation
         with command.prompt_interrupts():
-            result = prt.validate(
-                loaded,
-                transport,
-                n_rows=rows,
-                n_columns=columns,
-                spp=spp,
-                seed=seed,
-                progress=not quiet,
-                image_spp=image_spp,
-            )
+            if isinstance(transport, prt.GlossyTransport):
+                result = validate_glossy(loaded, transport, spp=image_spp, seed=seed)
+            else:
+                result = prt.validate(
+                    loaded,
+                    transport,
+                    n_rows=rows,
+                    n_columns=columns,
+                    spp=spp,
+                    seed=seed,
+                    progress=not quiet,
+                    image_spp=image_spp,
+                )
         command.report = result.report
         if output is not None:
             result.save(output)
             command.written.append(output)
-        command.show(validation_table(result.report, f"{matrix} against Mitsuba"))
+        table = glossy_images_table if isinstance(transport, prt.GlossyTransport) else validation_table
+        command.show(table(result.report, f"{matrix} against Mitsuba"))
 
 
 @app.command()
@@ -426,7 +475,7 @@ def info(
         else:
             transport = prt.load_transport(file)
             command.report = transport.report | {"file": {"path": str(file), "bytes": file.stat().st_size}}
-            command.show(*matrix_tables(transport, file))
+            command.show(*_tables(transport, file))
 
 
 @app.command()
@@ -550,9 +599,15 @@ def benchmark(
         command.show(*tables)
 
 
+def _tables(transport: AnyTransport, file: Path, explain: bool = False) -> list[Table]:
+    if isinstance(transport, prt.GlossyTransport):
+        return glossy_matrix_tables(transport, file)
+    return [*(plan_tables(transport) if explain else []), *matrix_tables(transport, file)]
+
+
 def _scene_of(
-    transport: prt.LightTransport, matrix: Path, path: Path | None, parameters: dict[str, str]
-) -> tuple[prt.Scene, prt.LightTransport]:
+    transport: AnyTransport, matrix: Path, path: Path | None, parameters: dict[str, str]
+) -> tuple[prt.Scene, AnyTransport]:
     """The scene of a matrix, loaded as ``precompute`` loaded it, and the matrix in this scene's vertex order."""
     recorded = transport.report.get("scene", {})
     if path is None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
+from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.validation.glossy import CAUSES
@@ -356,10 +357,38 @@ def glossy_tables(report: dict[str, Any]) -> list[Table]:
     for found in report["factors"]:
         last = [_share(found[name][-1]) for name in ("whole", "grazing", "peak")]
         factors.add_row(f"{found['mesh']}, {found['terms']} terms", *last)
-    images = _table("Images (largest relative L2)", "", *CAUSES)
-    for region, errors in report["images"]["worst"].items():
+    return [times, factors, glossy_images_table(report["images"], "Images")]
+
+
+def glossy_images_table(report: dict[str, Any], title: str) -> Table:
+    """What ``validate_glossy`` found."""
+    images = _table(f"{title} (largest relative L2)", "", *CAUSES)
+    for region, errors in report["worst"].items():
         images.add_row(region.replace("_", " "), *(_share(errors[cause]) for cause in CAUSES))
-    return [times, factors, images]
+    return images
+
+
+def glossy_matrix_tables(transport: GlossyTransport, path: Path) -> list[Table]:
+    """What was done, how long it took and how large it is."""
+    report, (n, directions) = transport.report, (len(transport.albedo), transport.lighting.n_directions)
+    done = _table(f"{path}: {n} vertices x {directions} directions, view-dependent", "", "")
+    done.add_row("glossy vertices", f"{report['glossy_vertices']:,}")
+    for name, count in report["rays"].items():
+        done.add_row({"direct": "shadow rays"}.get(name, f"{name} rays"), f"{count:,}")
+    done.add_row("matrix in memory", _bytes(transport.nbytes))
+    done.add_row("file", _bytes(path.stat().st_size))
+    done.add_row("peak memory", _bytes(report["peak_memory_bytes"]))
+    for name in ("terms", "harmonics", "max_depth", "rays", "tolerance"):
+        done.add_row(name, str(report["parameters"][name]))
+    done.add_row("seed", str(report["seed"]))
+    for name in ("path", "hash"):
+        done.add_row(f"scene {name}", str(report["scene"][name]))
+    done.add_row("versions", ", ".join(f"{name} {number}" for name, number in report["versions"].items()))
+    phases = _table("Time", "phase", "time")
+    for name, seconds in report["seconds"].items():
+        phases.add_row(name, _duration(seconds))
+    warned = report["scene"]["warnings"]
+    return [done, phases, *([_sentences("Warnings", warned)] if warned else [])]
 
 
 def _plan(plan: dict[str, Any]) -> str:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mi_sparse_prt.cache import cached_precompute
+from mi_sparse_prt.cache import cached_glossy, cached_precompute
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.errors import PrtError, PrtWarning
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.settings import Settings
@@ -78,7 +77,6 @@ class SparsePRT(mi.SamplingIntegrator):
         }
         Settings(self._lighting.resolution, **self._settings)  # complains now, not when rendering
         self._terms = props.get("terms", 0)
-        self._glossy: GlossyTransport | None = None  # of the scene that was rendered last
         self._edge_length = props.get("edge_length", 0.0) or None
         cache = props.get("cache", "")
         self._cache = Path(cache) if cache else None
@@ -124,16 +122,9 @@ class SparsePRT(mi.SamplingIntegrator):
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter) -> RelitScene:
         if self._terms > 0:
-            if self._glossy is None or self._glossy.scene_hash != surfaces.hash:
-                self._glossy = precompute_glossy(
-                    surfaces,
-                    self._lighting,
-                    self._terms,
-                    max_depth=self._settings["max_depth"],
-                    seed=self._settings["seed"],
-                    progress=self._progress,
-                )
-            return GlossyRelitScene(surfaces, self._glossy, environment, environment)
+            chosen = {name: self._settings[name] for name in ("max_depth", "seed")} | {"terms": self._terms}
+            glossy = cached_glossy(surfaces, self._lighting, self._cache, self._progress, **chosen)
+            return GlossyRelitScene(surfaces, glossy, environment, environment)
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         return RelitScene(surfaces, transport.irradiance(environment), environment)
 

@@ -109,8 +109,7 @@ class GlossyRelitScene(RelitScene):
     def __init__(
         self, scene: Scene, transport: GlossyTransport, environment: Any, background: mi.Emitter | None
     ) -> None:
-        if transport.scene_hash != scene.hash:
-            raise PrtError(f"this matrix belongs to another scene than {scene.path or 'the one given'}")
+        transport = transport.for_scene(scene)
         found = transport.coefficients(environment)
         super().__init__(scene, found.white, background)
         self._diffuse = mi.Color3f(np.ascontiguousarray(transport.albedo.T))
