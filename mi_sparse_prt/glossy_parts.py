@@ -18,6 +18,8 @@ from mi_sparse_prt.blocks import rows_times
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.matrix import Visibility
 
+LANES = 4  # terms at a time
+
 Rows = NDArray[np.integer]
 Floats = NDArray[np.float32]
 
@@ -70,6 +72,11 @@ class FactoredVisibility:
         """The rows of all vertices."""
         return Visibility(self.bits, self.normals, self.lighting)
 
+    @cached_property
+    def _padded(self) -> Floats:
+        """Tables with as many terms as vector instructions take."""
+        return np.pad(self.tables, ((0, 0), (0, 0), (0, 0), (0, -self.terms % LANES)))
+
     def with_rows(self, ids: Rows) -> tuple[FactoredVisibility, NDArray[np.int64]]:
         """A smaller part that has some rows, and where in it they are (len(ids),)."""
         ids, n = np.asarray(ids), len(self.bits)
@@ -109,9 +116,12 @@ class FactoredVisibility:
 
     def relight(self, lighting: Floats) -> Floats:
         directions, power = np.ascontiguousarray(self.lighting.directions.T), self._power(lighting)
-        own = self.glossy, self.frames, self.materials, self.tables
+        own = self.glossy, self.frames, self.materials, self._padded
         return np.concatenate(
-            [self.white.relight(lighting), _relit(self.bits, *own, directions, power).reshape(-1, 3)]
+            [
+                self.white.relight(lighting),
+                _relit(self.bits, *own, directions, power, self.terms).reshape(-1, 3),
+            ]
         )
 
     def reordered(self, source: Rows) -> FactoredVisibility:
@@ -136,26 +146,31 @@ class FactoredVisibility:
         texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
         directions = np.ascontiguousarray(np.moveaxis(self.lighting.directions[texels], 2, 1))
         power = signs * self.lighting.solid_angles[texels]
-        own = self.glossy, self.frames, self.materials, self.tables
+        own = self.glossy, self.frames, self.materials, self._padded
         places = np.asarray(words, np.int64)
-        found = _combined(self.bits, *own, places, directions, power.astype(np.float32))
+        found = _combined(self.bits, *own, places, directions, power.astype(np.float32), self.terms)
         return found.reshape(-1, signs.shape[1])
 
     def _term_values(self, which: Rows, texels: Rows) -> Floats:
         """Terms (n, K, m) of some glossy vertices at some texels."""
-        some = self.glossy[which], self.frames[which], self.materials[which], self.tables
+        some = self.glossy[which], self.frames[which], self.materials[which], self._padded
         directions = np.ascontiguousarray(self.lighting.directions[texels].T)
         words, shifts = np.divmod(np.asarray(texels, np.int64), BITS)
         power = self.lighting.solid_angles[texels].astype(np.float32)
-        return _expanded(self.bits, *some, words, shifts.astype(np.uint32), directions, power)
+        return _expanded(self.bits, *some, words, shifts.astype(np.uint32), directions, power, self.terms)
 
     def _power(self, lighting: Floats) -> Floats:
         return (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
 
 
 @numba.njit(fastmath=True, inline="always")
-def _add(total: Floats, table: Floats, frame: Floats, u: Any, v: Any, w: Any, weight: Any) -> None:
-    """Add weight times the values (K,) of a table (size, size, K) in direction (u, v, w), turned by a frame."""
+def _add(
+    total: Floats, place: int, table: Floats, frame: Floats, u: Any, v: Any, w: Any, weight: Any
+) -> None:
+    """Add weight times the values of a table (size, size, K) in direction (u, v, w), turned by a frame.
+
+    To total[place], whose length K is a multiple of LANES: loops of known length become vector instructions.
+    """
     one, size = np.float32(1), table.shape[0]
     z = frame[2, 0] * u + frame[2, 1] * v + frame[2, 2] * w
     half = np.float32(0.5 * (size - 1))
@@ -166,13 +181,15 @@ def _add(total: Floats, table: Floats, frame: Floats, u: Any, v: Any, w: Any, we
     a, b = a - np.float32(column), b - np.float32(row)
     p, q = weight * (one - a) * (one - b), weight * a * (one - b)
     r, s = weight * (one - a) * b, weight * a * b
-    for k in range(table.shape[2]):
-        total[k] += (
-            p * table[row, column, k]
-            + q * table[row, column + 1, k]
-            + r * table[row + 1, column, k]
-            + s * table[row + 1, column + 1, k]
-        )
+    for first in range(0, table.shape[2], LANES):
+        for lane in range(LANES):
+            k = first + lane
+            total[place, k] += (
+                p * table[row, column, k]
+                + q * table[row, column + 1, k]
+                + r * table[row + 1, column, k]
+                + s * table[row + 1, column + 1, k]
+            )
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
@@ -186,18 +203,20 @@ def _expanded(
     shifts: NDArray[np.uint32],
     directions: Floats,
     power: Floats,
+    terms: int,
 ) -> Floats:
-    """Terms (n, K, m) at directions (3, m)."""
-    result = np.zeros((len(vertices), tables.shape[3], len(words)), np.float32)
+    """Terms (n, terms, m) at directions (3, m)."""
+    result = np.zeros((len(vertices), terms, len(words)), np.float32)
     for i in numba.prange(len(vertices)):
-        value = np.empty(tables.shape[3], np.float32)
+        value = np.empty((1, tables.shape[3]), np.float32)
         for j in range(len(words)):
             if (bits[vertices[i], words[j]] >> shifts[j]) & np.uint32(1) == 0:
                 continue
             u, v, w = directions[0, j], directions[1, j], directions[2, j]
             value[:] = 0
-            _add(value, tables[materials[i]], frames[i], u, v, w, power[j])
-            result[i, :, j] = value
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, power[j])
+            for k in range(terms):
+                result[i, k, j] = value[0, k]
     return result
 
 
@@ -210,21 +229,23 @@ def _relit(
     tables: Floats,
     directions: Floats,
     power: Floats,
+    terms: int,
 ) -> Floats:
-    """Coefficients (n, K, 3) under lights power (n_directions, 3), solid angles included."""
-    terms = tables.shape[3]
-    result = np.zeros((len(vertices), terms, 3), np.float32)
+    """Coefficients (n, terms, 3) under lights power (n_directions, 3), solid angles included."""
+    result = np.empty((len(vertices), terms, 3), np.float32)
     for i in numba.prange(len(vertices)):
-        value = np.empty(terms, np.float32)
+        total = np.zeros((3, tables.shape[3]), np.float32)
+        value = np.empty((1, tables.shape[3]), np.float32)
         for j in range(directions.shape[1]):
             if (bits[vertices[i], j // 32] >> np.uint32(j % 32)) & np.uint32(1) == 0:
                 continue
             u, v, w = directions[0, j], directions[1, j], directions[2, j]
             value[:] = 0
-            _add(value, tables[materials[i]], frames[i], u, v, w, np.float32(1))
-            for k in range(terms):
-                for c in range(3):
-                    result[i, k, c] += value[k] * power[j, c]
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, np.float32(1))
+            for c in range(3):
+                for k in range(tables.shape[3]):
+                    total[c, k] += value[0, k] * power[j, c]
+        result[i] = total.T[:terms]
     return result
 
 
@@ -238,12 +259,13 @@ def _combined(
     words: NDArray[np.int64],
     directions: Floats,
     power: Floats,
+    terms: int,
 ) -> Floats:
-    """Sums (n, K, b) over words of the terms at their bits; directions (words, 3, b), power (words, b)."""
-    terms, width = tables.shape[3], power.shape[1]
-    result = np.zeros((len(vertices), terms, width), np.float32)
+    """Sums (n, terms, b) over words of the terms at their bits; directions (words, 3, b), power (words, b)."""
+    width = power.shape[1]
+    result = np.empty((len(vertices), terms, width), np.float32)
     for i in numba.prange(len(vertices)):
-        value = np.empty(terms, np.float32)
+        total = np.zeros((width, tables.shape[3]), np.float32)
         for g in range(len(words)):
             mask = bits[vertices[i], words[g]]
             if mask == 0:
@@ -252,8 +274,6 @@ def _combined(
                 if (mask >> np.uint32(b)) & np.uint32(1) == 0:
                     continue
                 u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
-                value[:] = 0
-                _add(value, tables[materials[i]], frames[i], u, v, w, power[g, b])
-                for k in range(terms):
-                    result[i, k, b] += value[k]
+                _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b])
+        result[i] = total.T[:terms]
     return result
