@@ -278,7 +278,7 @@ def precompute_glossy(
     rays : int
         Per vertex, that gather indirect light; a power of two.
     tolerance : float
-        Relative L2 error that a low rank may cost the first bounce.
+        Relative L2 error that a low rank may cost the first bounce; at least as much as the rays have noise.
     seed : int
     progress : bool
         Show progress bars.
@@ -286,7 +286,8 @@ def precompute_glossy(
     Returns
     -------
     GlossyTransport
-        With ``report``: ``seconds`` per phase, ``rays``, ``ranks``, ``glossy_vertices``, ``peak_memory_bytes``,
+        With ``report``: ``seconds`` per phase, ``rays``, ``ranks``, ``noise_of_rays`` (relative L2,
+        in the first bounce), ``glossy_vertices``, ``peak_memory_bytes``,
         ``seed``, ``scene``, ``parameters``, ``versions``.
 
     Raises
@@ -316,15 +317,18 @@ def precompute_glossy(
         material[glossy],
         incident_tables(factors),
     )
-    indirect = None
+    indirect, noise = None, None
     if max_depth != 2:
         with clock.phase("indirect"):
             shades, out = _channels(albedo, outgoing_tables(factors))
-            indirect = glossy_indirect(scene, points, part, out, shades, rays, tolerance, max_depth, seed)
+            indirect, noise = glossy_indirect(
+                scene, points, part, out, shades, rays, tolerance, max_depth, seed
+            )
     report = {
         "seconds": clock.report(),
         "rays": light.rays | ({} if indirect is None else {"gather": len(points) * rays}),
         "ranks": [] if indirect is None else list(indirect.ranks),
+        "noise_of_rays": noise,
         "glossy_vertices": len(glossy),
         "peak_memory_bytes": peak_memory(),
         "seed": seed,

@@ -2,6 +2,7 @@
 
 from mi_sparse_prt.benchmark.choices import measure_choices
 from mi_sparse_prt.benchmark.cpca import measure_cpca
+from mi_sparse_prt.benchmark.gallery import draw_gallery, save_gallery
 from mi_sparse_prt.benchmark.glossy import measure_glossy
 from mi_sparse_prt.benchmark.methods import measure_methods
 from mi_sparse_prt.benchmark.plans import measure_plans
@@ -11,11 +12,13 @@ from mi_sparse_prt.benchmark.time_error import time_against_error
 
 __all__ = [
     "cost_against_size",
+    "draw_gallery",
     "measure_choices",
     "measure_cpca",
     "measure_glossy",
     "measure_methods",
     "measure_plans",
     "run_benchmark",
+    "save_gallery",
     "time_against_error",
 ]

@@ -24,19 +24,20 @@ def cluster_picture(scene: Scene, compressed: LightTransport | GlossyTransport, 
     shown = colours[compressed.direct.labels[: scene.n_vertices]]  # terms have their vertex' cluster
     relit = RelitScene(scene, shown / np.maximum(scene.albedo, 1e-3), None)  # colours, not reflectance
     image = np.array(mi.render(scene.mitsuba, integrator=RelitIntegrator(relit), spp=spp))[..., :3]
-    return _side_by_side([image], [f"{len(colours)} clusters"])
+    return side_by_side([image], [f"{len(colours)} clusters"])
 
 
 def relit_pictures(full: Floats, compressed: Floats) -> Figure:
     """Images (height, width, 3) from the whole matrix and from the compressed one, and ten times their difference."""
     scale = 1 / np.percentile(full, 99)
     difference = 10 * np.abs(compressed - full)
-    return _side_by_side(
+    return side_by_side(
         [full * scale, compressed * scale, difference * scale], ["matrix", "compressed", "difference x 10"]
     )
 
 
-def _side_by_side(images: list[Floats], titles: list[str]) -> Figure:
+def side_by_side(images: list[Floats], titles: list[str]) -> Figure:
+    """Images (height, width, 3), linear, in a line; 1 is white."""
     figure = Figure(figsize=(5 * len(images), 4.2), layout="constrained")
     for axes, image, title in zip(
         np.atleast_1d(figure.subplots(1, len(images))), images, titles, strict=True

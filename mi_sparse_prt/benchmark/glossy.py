@@ -75,7 +75,9 @@ def measure_glossy(
         "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
         "brute_force": brute,
     }
-    images = validate_glossy(scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH)
+    images = validate_glossy(
+        scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH, progress=progress
+    )
     if figures is not None:
         images.save(figures)
         for number, factors in enumerate(transport.factors):

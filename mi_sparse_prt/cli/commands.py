@@ -20,6 +20,7 @@ from mi_sparse_prt.cli.tables import (
     benchmark_tables,
     choices_tables,
     cpca_tables,
+    files_table,
     glossy_images_table,
     glossy_matrix_tables,
     glossy_tables,
@@ -432,7 +433,7 @@ def validate(
         result: Validation | GlossyValidation
         with command.prompt_interrupts():
             if isinstance(transport, prt.GlossyTransport):
-                result = validate_glossy(loaded, transport, spp=image_spp, seed=seed)
+                result = validate_glossy(loaded, transport, spp=image_spp, seed=seed, progress=not quiet)
             else:
                 result = prt.validate(
                     loaded,
@@ -597,6 +598,41 @@ def benchmark(
         if figures is not None:
             command.written.append(figures)
         command.show(*tables)
+
+
+@app.command()
+def pictures(
+    scenes: Annotated[
+        list[Path], typer.Argument(metavar="SCENE...", help="Mitsuba scenes, XML files.", show_default=False)
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FOLDER", help="PNG files go there.", show_default=False),
+    ],
+    resolution: Annotated[
+        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
+    ] = DEFAULT_RESOLUTION,
+    edge_length: EdgeLength = None,
+    define: Define = None,
+    variant: Variant = None,
+    quiet: Quiet = False,
+) -> None:
+    """Draw scenes relit beside Mitsuba's path, whole and compressed, with clusters and factors of BRDFs.
+
+    Example: mi-sparse-prt pictures scenes_xml/spot.xml scenes_xml/glossy_bunny.xml -o pictures
+
+    Glossy surfaces are shaded for the view, as in Figures 17 to 19 of [HR10].
+    """
+    from mi_sparse_prt import benchmark as benchmarks
+
+    with running(None, quiet) as command:
+        check_folder(output)
+        for path in scenes:
+            scene = prt.load_scene(path, edge_length, **_definitions(define))
+            with command.prompt_interrupts():
+                figures = benchmarks.draw_gallery(scene, prt.CubemapLighting(resolution), progress=not quiet)
+            command.written += benchmarks.save_gallery(figures, output, path.stem)
+        command.show(files_table(command.written))
 
 
 def _tables(transport: AnyTransport, file: Path, explain: bool = False) -> list[Table]:

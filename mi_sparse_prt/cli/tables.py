@@ -143,6 +143,14 @@ def relighting_table(title: str, seconds: dict[str, float], files: dict[Path, by
     return table
 
 
+def files_table(paths: list[Path]) -> Table:
+    """What was written."""
+    table = _table("Written", "")
+    for path in paths:
+        table.add_row(str(path))
+    return table
+
+
 def validation_table(report: dict[str, Any], title: str) -> Table:
     """Errors of rows, columns and image, and the reference's own noise (see ``Validation``)."""
     table = _table(title, "relative L2 unless said otherwise", "")

@@ -294,7 +294,9 @@ class _Samples:
                 direction, solid_angle = texels.inside(texel, rng.next_float32(), rng.next_float32())
                 irradiance = solid_angle / texels.solid_angle(texel)
             value = paths.throughput * bsdf.eval(context, si, si.to_local(direction)) * irradiance
-            lit = ~dr.all(value <= 0)  # NaN is lit, so that it is noticed
+            lit = ~dr.all(
+                value == 0
+            )  # NaN is lit, so that it is noticed, and what factored BSDFs make negative
             lit &= ~solver.scene.ray_test(si.spawn_ray(direction), lit)
             for c in range(solver.channels):
                 dr.scatter(here[c], value[c], paths.row * n + texel, lit, dr.ReduceMode.NoConflicts)
@@ -315,7 +317,7 @@ class _Samples:
             mi.BSDFContext(), si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         )
         throughput = paths.throughput * weight
-        survival = dr.minimum(dr.max(throughput), SURVIVAL)
+        survival = dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL)
         ends = rng.next_float32() >= survival  # never for NaN, so that it is noticed
         paths.throughput = dr.select(ends, 0, throughput / survival)
         ray = si.spawn_ray(si.to_world(sample.wo))

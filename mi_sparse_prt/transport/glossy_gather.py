@@ -7,6 +7,8 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numba
@@ -21,12 +23,16 @@ from mi_sparse_prt.measurement.factor_tables import looked_up
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene import Scene
 from mi_sparse_prt.transport.contacts import contacts
+from mi_sparse_prt.transport.direct_columns import DirectColumns
+from mi_sparse_prt.transport.first_bounce import MIXED
 from mi_sparse_prt.transport.gather import NEGLIGIBLE, FiniteElements
 from mi_sparse_prt.transport.gather_matrix import BEHIND, LANES, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.transport.lanes import PointArrays
 from mi_sparse_prt.transport.nodes import Nodes
 
 MOST_BOUNCES = 64  # where there is no limit
+NOISE_VERTICES = 4096  # at which noise is looked at
+MOST_NOISE = 0.5  # of the first bounce: a tolerance beyond would leave it out
 
 Floats = NDArray[np.float32]
 
@@ -91,15 +97,61 @@ class GlossyGather(FiniteElements):
         return count
 
 
-def glossy_gather_matrices(
+@dataclass(frozen=True)
+class GatherRays:
+    """What rays from all vertices meet, ordered by vertices.
+
+    Attributes
+    ----------
+    point, seen : (m,) int64
+        The vertex that a ray gathers for, and the one it meets.
+    number : (m,) int64
+        Of a ray among those of its vertex, side by side.
+    into : (m, 1 + K) float32
+        Weights in white light and in the terms of ``point``, times the number of rays.
+    out : (m, channels * K) float32
+        g_k of ``seen`` towards the ray's origin.
+    per_vertex : int
+        Rays, those that meet nothing among them.
+    """
+
+    point: NDArray[np.int64]
+    seen: NDArray[np.int64]
+    number: NDArray[np.int64]
+    into: Floats
+    out: Floats
+    per_vertex: int
+
+    def noise(self, direct: FactoredVisibility, albedo: Floats, points: Points, seed: int) -> float:
+        """Relative L2 of what their randomness leaves in the first bounce of white light.
+
+        From how far two halves of them differ, at some vertices and under random sums of columns.
+        ``albedo`` is that of one channel, (n_v,).
+        """
+        some = np.argsort(mix(points.keys), kind="stable")[:NOISE_VERTICES]
+        row = np.full(len(points), -1)
+        row[some] = np.arange(len(some))
+        own = np.flatnonzero(row[self.point] >= 0)
+        # rays are in Morton's order, so that this is a checkerboard
+        half = (np.bitwise_count(self.number[own]) % 2).astype(np.int64)
+        shape = 2 * len(some), len(points)
+        place = row[self.point[own]] + half * len(some), self.seen[own]
+        halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
+        light = DirectColumns(direct.white, direct.lighting).combined(MIXED, np.random.default_rng(seed))
+        first, second = np.split(halves @ light, 2)
+        norm = float(np.linalg.norm(first + second))
+        return float(np.linalg.norm(first - second)) / norm if norm > 0 else 0.0
+
+
+def gather_rays(
     scene: Scene,
     points: Points,
     direct: FactoredVisibility,
     outgoing: Floats,
     rays_per_vertex: int,
     seed: int,
-) -> list[scipy.sparse.csr_array]:
-    """G (n, n) over white light of all vertices and terms of the glossy ones, one matrix per channel.
+) -> GatherRays:
+    """Cosine-distributed rays from all vertices.
 
     Parameters
     ----------
@@ -107,7 +159,7 @@ def glossy_gather_matrices(
     points : Points
         Of all vertices.
     direct : FactoredVisibility
-        Whose rows these are; it has the frames and the incident factors.
+        It has the frames and the incident factors.
     outgoing : (channels, materials, size, size, K) float32
         g_k.
     rays_per_vertex : int
@@ -125,11 +177,13 @@ def glossy_gather_matrices(
         weights, values = lobes.incident(point, ray.d), lobes.outgoing(vertex, -ray.d)
         dr.eval(vertex, weights, values)
         met = np.flatnonzero(vertex.numpy() < BEHIND)
-        hits.append(np.stack([point.numpy()[met], vertex.numpy()[met]]).astype(np.int64))
+        hits.append(
+            np.stack([point.numpy()[met], vertex.numpy()[met], met % rays_per_vertex]).astype(np.int64)
+        )
         into.append(np.stack([np.ones(len(met), np.float32), *(w.numpy()[met] for w in weights)], axis=1))
         out.append(np.stack([v.numpy()[met] for v in values], axis=1))
-    joined = np.concatenate(hits, axis=1), np.concatenate(into), np.concatenate(out)
-    return [_assembled(direct, rays_per_vertex, c, *joined) for c in range(len(outgoing))]
+    point, seen, number = np.concatenate(hits, axis=1)
+    return GatherRays(point, seen, number, np.concatenate(into), np.concatenate(out), rays_per_vertex)
 
 
 class Lobes:
@@ -176,36 +230,21 @@ def _with_dark(tables: Floats) -> mi.Float:
     return mi.Float(np.concatenate([tables, dark]).ravel())
 
 
-def _assembled(
-    direct: FactoredVisibility,
-    rays: int,
-    channel: int,
-    hits: NDArray[np.int64],
-    into: Floats,
-    out: Floats,
-) -> scipy.sparse.csr_array:
-    """The matrix of one channel: rays (m,) with their point and vertex, ordered by points, and their factors."""
+def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
+    """G (n, n) of one channel, over white light of all vertices and terms of the glossy ones."""
     n, terms = len(direct.bits), direct.terms
     number = np.full(n, -1)  # of a vertex among the glossy ones
     number[direct.glossy] = np.arange(len(direct.glossy))
     own = slice(channel * terms, (channel + 1) * terms)
-    entries = 1 + terms * (number[hits[1]] >= 0)  # of a ray, in each row that it is in
-    lengths = np.bincount(hits[0], weights=entries, minlength=n).astype(np.int64)
+    entries = 1 + terms * (number[rays.seen] >= 0)  # of a ray, in each row that it is in
+    lengths = np.bincount(rays.point, weights=entries, minlength=n).astype(np.int64)
     starts = np.concatenate(
         [[0], np.cumsum(np.concatenate([lengths, np.repeat(lengths[direct.glossy], terms)]))]
     )
     columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
-    first = np.searchsorted(hits[0], np.arange(n + 1))
-    _fill(
-        first,
-        hits[1],
-        number,
-        into / np.float32(rays),
-        np.ascontiguousarray(out[:, own]),
-        starts,
-        columns,
-        values,
-    )
+    first = np.searchsorted(rays.point, np.arange(n + 1))
+    into, out = rays.into / np.float32(rays.per_vertex), np.ascontiguousarray(rays.out[:, own])
+    _fill(first, rays.seen, number, into, out, starts, columns, values)
     return scipy.sparse.csr_array((values, columns, starts), shape=(direct.count, direct.count))
 
 
@@ -246,24 +285,25 @@ def glossy_indirect(
     tolerance: float,
     max_depth: int,
     seed: int,
-) -> Factored:
-    """Indirect light of all rows of ``direct``, factored per channel.
+) -> tuple[Factored, float]:
+    """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
     Parameters
     ----------
     scene, points, direct, outgoing, rays_per_vertex, seed
-        As for ``glossy_gather_matrices``.
+        As for ``gather_rays``.
     albedo : (n_v, channels) float32
         Of the diffuse part of each vertex.
     tolerance : float
-        As for ``GatherTransport.indirect``.
+        As for ``GatherTransport.indirect``; no less than the noise of the rays, whose rank is full.
     max_depth : int
     """
     ones = np.ones(direct.count - len(albedo), np.float32)
+    rays = gather_rays(scene, points, direct, outgoing, rays_per_vertex, seed)
+    noise = rays.noise(direct, albedo.mean(axis=1), points, seed)
     found = []
-    for matrix, shade in zip(
-        glossy_gather_matrices(scene, points, direct, outgoing, rays_per_vertex, seed), albedo.T, strict=True
-    ):
+    for channel, shade in enumerate(albedo.T):
+        matrix = gather_matrix(direct, rays, channel)
         solver = GlossyGather(matrix, np.concatenate([shade, ones]), scene, points, direct, max_depth, seed)
-        found.append(solver.indirect(direct, tolerance))
-    return Factored(tuple(f.left[0] for f in found), tuple(f.right[0] for f in found))
+        found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE))))
+    return Factored(tuple(f.left[0] for f in found), tuple(f.right[0] for f in found)), noise

@@ -23,6 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
@@ -92,6 +93,7 @@ def validate_glossy(
     spp: int = 256,
     width: int = 320,
     seed: int = 0,
+    progress: bool = False,
 ) -> GlossyValidation:
     """Compare relit images of a glossy scene with Mitsuba's ``path``, cause by cause.
 
@@ -110,6 +112,8 @@ def validate_glossy(
     width : int
         Of images, pixels; sensors keep their films' shape, and get their own size back.
     seed : int
+    progress : bool
+        Show a progress bar.
 
     Returns
     -------
@@ -136,17 +140,21 @@ def validate_glossy(
             raise PrtError("validate_glossy: the scene has no environment emitter; give environments")
         environments = {"scene": own}
     images, figures = [], {}
-    for i, (name, environment) in enumerate(environments.items()):
-        radiance = transport.lighting.project(environment)
-        references = _References(scene, transport, radiance)
-        for j, (sensor, turn) in enumerate(views):
-            with _posed(sensor, width, turn, scene.centre):
-                regions = references.regions(sensor, spp, _seed(seed, i, j, 99))
-                rendered = references.rendered(sensor, spp, (seed, i, j))
-            camera = {"number": j} if sensors else {"number": j, "turned": turn}
-            entry, figure = _compared(rendered, regions)
-            images.append({"environment": name, "camera": camera, **entry})
-            figures[f"{name}_{j}"] = figure
+    with tqdm(
+        total=len(environments) * len(views), desc="images", unit=" images", disable=not progress
+    ) as bar:
+        for i, (name, environment) in enumerate(environments.items()):
+            radiance = transport.lighting.project(environment)
+            references = _References(scene, transport, radiance)
+            for j, (sensor, turn) in enumerate(views):
+                with _posed(sensor, width, turn, scene.centre):
+                    regions = references.regions(sensor, spp, _seed(seed, i, j, 99))
+                    rendered = references.rendered(sensor, spp, (seed, i, j))
+                camera = {"number": j} if sensors else {"number": j, "turned": turn}
+                entry, figure = _compared(rendered, regions)
+                images.append({"environment": name, "camera": camera, **entry})
+                figures[f"{name}_{j}"] = figure
+                bar.update()
     report = {
         "images": images,
         "worst": _worst(images),
@@ -249,10 +257,10 @@ class _References:
         factored = _factored_shapes(scene, transport, shapes)
         white = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}})
         self._lit = {
-            "real": _lit(shapes, sky),
-            "factored": _lit(factored, sky),
-            "directions": _lit(factored, DirectionLights(lights)),
-            "diffuse": _lit([with_bsdf(shape, white) for shape in shapes], sky),
+            "real": lit_scene(shapes, sky),
+            "factored": lit_scene(factored, sky),
+            "directions": lit_scene(factored, DirectionLights(lights)),
+            "diffuse": lit_scene([with_bsdf(shape, white) for shape in shapes], sky),
         }
         depth = transport.report["parameters"]["max_depth"]
         self._depth = MOST_BOUNCES if depth < 0 else depth
@@ -334,7 +342,8 @@ def thin_shadows(lit: Image, shape: NDArray[np.integer], normal: Image) -> Mask:
     return found
 
 
-def _lit(shapes: Sequence[mi.Shape], light: mi.Emitter) -> mi.Scene:
+def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter) -> mi.Scene:
+    """Shapes under one light, which rays do not slip between."""
     named = {f"shape_{k}": shape for k, shape in enumerate(shapes)}
     return mi.load_dict({**watertight_scene(), "light": light, **named})
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.validation.glossy import validate_glossy
 from mi_sparse_prt.validation.reference import ReferenceMatrix
 from mi_sparse_prt.validation.validate import matrix_errors
 
@@ -267,11 +268,12 @@ def test_lamps_do_not_take_part_in_reference_images():
 
 #: Edge lengths for what has no fine mesh of its own.
 EDGES = {"cornell": 0.1, "terrace": 0.2, "pergola": 0.2}
+GLOSSY = ("glossy_bunny", "glossy_spot", "glossy_teapot", "lamp")
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.errors.PrtWarning")
-@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [p for p in SCENES if p.stem not in GLOSSY], ids=lambda path: path.stem)
 def test_scenes(path):
     """Each scene of scenes_xml at n = 8, texel basis, its indirect light at n = 4: rows, columns and its picture.
 
@@ -303,3 +305,24 @@ def test_scenes(path):
     assert report["direct_at_hits"] < (0.01 if path.stem == "spot" else 1e-3)
     assert report["relative_l2"]["total"] == pytest.approx(report["estimated_error"]["total"], rel=0.33)
     assert report["image"]["relative_l2"] < report["image"]["interpolation"] + 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.errors.PrtWarning")
+@pytest.mark.parametrize("name", GLOSSY)
+def test_glossy_scenes(name):
+    """Scenes with glossy surfaces at n = 16, from three cameras: what is not the factors' fault.
+
+    Expected: within 2% of the image, 4% of its glossy pixels, where vertices are the scene's own. The lamp's light goes
+    through slats, whose shadows are narrower than triangles: 5%.
+    """
+    path = next(p for p in SCENES if p.stem == name)
+    scene = prt.load_scene(path, width=240, height=180)
+    transport = prt.precompute_glossy(scene, prt.CubemapLighting(16), progress=False)
+    validation = validate_glossy(scene, transport, spp=256, width=240)
+    validation.save(ARTEFACTS / f"validate_{name}")
+    worst = validation.report["worst"]
+    print(name, json.dumps(worst))
+    few = 0.05 if name == "lamp" else 0.02
+    assert worst["image"]["transport"] < few
+    assert worst["glossy"]["transport"] < 2 * few

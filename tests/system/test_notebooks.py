@@ -49,6 +49,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "RESOLUTION": 4,
         "EDGE_LENGTH": 1e9,
         "TERMS": 2,
+        "HARMONICS": 1,
         "DIFFUSE_SCENE": "terrace",
         "IMAGE_WIDTH": 96,
         "IMAGE_SPP": 2,
