@@ -334,7 +334,7 @@ def precompute_glossy(
         "seed": seed,
         "scene": scene.summary,
         "parameters": {
-            "terms": factors[0].terms,
+            "terms": max(found.terms for found in factors),
             "harmonics": harmonics,
             "direct": direct,
             "max_depth": max_depth,

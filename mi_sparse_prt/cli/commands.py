@@ -615,6 +615,7 @@ def pictures(
     edge_length: EdgeLength = None,
     define: Define = None,
     variant: Variant = None,
+    json_file: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Draw scenes relit beside Mitsuba's path, whole and compressed, with clusters and factors of BRDFs.
@@ -625,13 +626,14 @@ def pictures(
     """
     from mi_sparse_prt import benchmark as benchmarks
 
-    with running(None, quiet) as command:
+    with running(json_file, quiet) as command:
         check_folder(output)
         for path in scenes:
             scene = prt.load_scene(path, edge_length, **_definitions(define))
             with command.prompt_interrupts():
                 figures = benchmarks.draw_gallery(scene, prt.CubemapLighting(resolution), progress=not quiet)
             command.written += benchmarks.save_gallery(figures, output, path.stem)
+        command.report = {"files": [str(path) for path in command.written]}
         command.show(files_table(command.written))
 
 

@@ -160,6 +160,32 @@ def test_fewer_terms_are_the_first_ones():
     assert many.first(3).terms == 3
 
 
+@pytest.mark.parametrize("terms", [1, 2, 3, 4, 5])
+def test_factors_of_an_isotropic_brdf_are_isotropic(terms):
+    """Turning both directions by one step of the grid changes nothing, whatever the number of terms.
+
+    The terms of this one go around the normal 0, 1, 1, 2, 2, 0 times: the first four of them are not isotropic.
+    """
+    bsdf, grid = mi.load_dict({"type": "roughconductor", "alpha": 0.3}), DirectionGrid(16, 32)
+    every = factor_brdf(bsdf, "ball", 8, grid)
+    found = every.complete(terms)
+    assert found.terms == terms
+    wi, wo = (some[::7] for some in pairs(TINY)[:2])
+    angle = 2 * np.pi / grid.azimuths
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]], np.float32)
+    peak = np.abs(found.values(wi, wo)).max()
+    assert np.abs(found.values(wi @ turn, wo @ turn) - found.values(wi, wo)).max() < 2e-3 * peak
+    if terms in (2, 4):
+        split = every.first(terms)
+        assert np.abs(split.values(wi @ turn, wo @ turn) - split.values(wi, wo)).max() > 2e-2 * peak
+
+
+def test_other_brdfs_keep_their_first_terms():
+    many = factor_brdf(mi.load_dict(BRUSHED), "ball", 8, SMALL)
+    assert np.array_equal(many.complete(4).incident, many.first(4).incident)
+
+
 def even_pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Random pairs of directions, by solid angle and by its product with the cosine."""
     rng = np.random.default_rng(5)

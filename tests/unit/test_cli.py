@@ -462,7 +462,7 @@ def test_usage_errors(arguments):
     assert "Usage" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["precompute", "relight", "validate", "info", "benchmark"])
+@pytest.mark.parametrize("command", ["precompute", "relight", "validate", "info", "benchmark", "pictures"])
 def test_help_teaches(command):
     text = call(command, "--help").stdout
     assert f"Example: mi-sparse-prt {command}" in " ".join(text.split())

@@ -183,8 +183,8 @@ def test_no_folder_is_no_reason_to_stop(counted, tmp_path):
 
 def test_fewest_terms_for_a_target(counted, tmp_path):
     bsdf = phong(5.0)
-    every = factors_of(bsdf, "vase", 16, folder=tmp_path)
-    error = factor_error(every, bsdf, "vase").whole
+    factors_of(bsdf, "vase", folder=tmp_path)
+    error = factor_error(counted.made(bsdf, "vase", 16, SMALL), bsdf, "vase").whole
     for target in (error[2], (error[7] + error[8]) / 2):
         found = factors_of(bsdf, "vase", target_error=float(target), folder=tmp_path)
         assert error[found.terms - 1] <= target < error[found.terms - 2]

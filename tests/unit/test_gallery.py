@@ -1,5 +1,8 @@
 """Pictures of scenes: what there is, and that it is not empty."""
 
+import json
+from pathlib import Path
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -15,9 +18,18 @@ def folder(tmp_path_factory):
     (folder / "dull.xml").write_text(SCENE)
     (folder / "glossy.xml").write_text(GLOSSY)
     result = call(
-        "pictures", folder / "dull.xml", folder / "glossy.xml", "-o", folder / "all/of/them", *OPTIONS
+        "pictures",
+        folder / "dull.xml",
+        folder / "glossy.xml",
+        "-o",
+        folder / "all/of/them",
+        *OPTIONS,
+        "--json",
+        folder / "done.json",
     )
     assert result.exit_code == 0, result.stderr
+    written = json.loads((folder / "done.json").read_text())["files"]
+    assert {Path(name) for name in written} == set((folder / "all/of/them").iterdir())
     return folder / "all/of/them"
 
 

@@ -40,7 +40,7 @@ def factors_of(
     name : str
         For messages.
     terms : int
-        K, 1 to 16; [HR10] takes 4.
+        K, 1 to 16; [HR10] takes 4. Fewer if one would be without its partner (``BrdfFactors.complete``).
     target_error : float, optional
         Relative L2 error over all pairs of directions, as ``factor_error`` measures it: the fewest terms that meet it,
         instead of ``terms``. If 16 do not, they are taken, and a `PrtWarning` says how far they are.
@@ -61,7 +61,7 @@ def factors_of(
         raise PrtError(f"shape '{name}': {terms} factors of its BRDF; give 1 to {MOST_TERMS}")
     factors, error = _found_or_made(bsdf, name, folder or _default_folder())
     if target_error is None:
-        return factors.first(terms)
+        return factors.complete(terms)
     enough = error.terms_for(target_error)
     if enough is None:
         warnings.warn(

@@ -34,6 +34,7 @@ LEFT_OVER = 16  # vectors more than terms that a basis begins with
 ITERATIONS = 2  # of it, multiplied with the matrix and its transpose
 FALL = 2.0  # power of light per spherical harmonic of degree l: (l + 1)^-FALL
 LIGHT_ORDER = 16  # degrees beyond have the power of the next one
+PURE = 0.98  # share of a term's power in one wave around the normal: the rest is rounding
 LANES = 1 << 21  # values of the BRDF at a time
 
 
@@ -69,6 +70,41 @@ class BrdfFactors:
     def first(self, terms: int) -> BrdfFactors:
         """With fewer terms."""
         return replace(self, incident=self.incident[:terms], outgoing=self.outgoing[:terms])
+
+    def complete(self, terms: int) -> BrdfFactors:
+        """At most so many terms, none without its partner.
+
+        Those of an isotropic BRDF vary as cos(m phi) or sin(m phi) around the normal, and come in pairs but for m = 0.
+        With one of a pair alone the sum would be anisotropic, and images would show where tangents turn: the next ones
+        that are whole are taken instead. Other BRDFs have their first terms.
+        """
+        waves = self._waves()
+        if waves is None:
+            return self.first(terms)
+        chosen: list[int] = []
+        k = 0
+        while k < len(waves):
+            group = 1 if waves[k] == 0 else 2
+            if len(chosen) + group <= terms and waves[k : k + group] == group * [waves[k]]:
+                chosen += range(k, k + group)
+            k += group
+        if not chosen:
+            return self.first(terms)
+        return replace(self, incident=self.incident[chosen], outgoing=self.outgoing[chosen])
+
+    def _waves(self) -> list[int] | None:
+        """How often each term goes around, m; None if one has several waves."""
+        found = []
+        for f, g in zip(self.incident, self.outgoing, strict=True):
+            parts = np.concatenate([f[None], g]).reshape(-1, self.grid.heights, self.grid.azimuths)
+            weights = self.grid.solid_angles.reshape(self.grid.heights, -1)[:, :1]
+            power = (np.abs(np.fft.rfft(parts, axis=2)) ** 2 * weights).sum(axis=1)  # [part, m]
+            share = power / np.maximum(power.sum(axis=1, keepdims=True), 1e-30)
+            m = int(share[0].argmax())
+            if share[:, m].min() < PURE:
+                return None
+            found.append(m)
+        return found
 
     def values(self, incident: Floats, outgoing: Floats) -> Doubles:
         """(m, channels) at pairs of directions (m, 3), local frame."""
