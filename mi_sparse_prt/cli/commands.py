@@ -99,6 +99,9 @@ Define = Annotated[
         "-D", "--define", metavar="NAME=VALUE", help="Value for a <default> of the scene; may be repeated."
     ),
 ]
+Resolution = Annotated[
+    int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
+]
 EdgeLength = Annotated[
     float | None,
     typer.Option(
@@ -156,9 +159,7 @@ def precompute(
             show_default=False,
         ),
     ],
-    resolution: Annotated[
-        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
-    ] = DEFAULT_RESOLUTION,
+    resolution: Resolution = DEFAULT_RESOLUTION,
     method: Annotated[
         Method,
         typer.Option(
@@ -482,9 +483,7 @@ def info(
 @app.command()
 def benchmark(
     scene: SceneFile,
-    resolution: Annotated[
-        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
-    ] = DEFAULT_RESOLUTION,
+    resolution: Resolution = DEFAULT_RESOLUTION,
     repeats: Annotated[
         int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")
     ] = 3,
@@ -609,9 +608,7 @@ def pictures(
         Path,
         typer.Option("--output", "-o", metavar="FOLDER", help="PNG files go there.", show_default=False),
     ],
-    resolution: Annotated[
-        int, typer.Option(help="Texels along an edge of the lighting's cubemap, a power of two.")
-    ] = DEFAULT_RESOLUTION,
+    resolution: Resolution = DEFAULT_RESOLUTION,
     edge_length: EdgeLength = None,
     define: Define = None,
     variant: Variant = None,

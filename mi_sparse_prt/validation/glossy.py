@@ -133,7 +133,9 @@ def validate_glossy(
     Thin shadows are the tenth of the pixels on smooth surfaces where the share of direct light that is not shadowed (of
     all that is in front of the surface, whatever its BSDF) changes most from pixel to pixel.
     """
-    _check(scene, transport, spp)
+    if spp < 2:
+        raise PrtError(f"validate_glossy: spp is {spp}; give at least 2, for two halves")
+    transport = transport.for_scene(scene)
     own, views = scene.mitsuba.environment(), _views(scene, sensors)
     if environments is None:
         if own is None:
@@ -161,13 +163,6 @@ def validate_glossy(
         "parameters": {"spp": spp, "width": width, "seed": seed} | transport.report.get("parameters", {}),
     }
     return GlossyValidation(report, figures)
-
-
-def _check(scene: Scene, transport: GlossyTransport, spp: int) -> None:
-    if transport.scene_hash != scene.hash:
-        raise PrtError(f"this matrix belongs to another scene than {scene.path or 'the one given'}")
-    if spp < 2:
-        raise PrtError(f"validate_glossy: spp is {spp}; give at least 2, for two halves")
 
 
 def _views(scene: Scene, sensors: Sequence[mi.Sensor] | None) -> list[tuple[mi.Sensor, int]]:

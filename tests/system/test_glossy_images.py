@@ -14,6 +14,8 @@ from mi_sparse_prt.validation.glossy import (
     CAUSES,
     DirectionLights,
     GlossyValidation,
+    _posed,
+    _References,
     relative_l2,
     thin_shadows,
     validate_glossy,
@@ -101,6 +103,46 @@ def test_what_is_blamed(good, artefact):
     assert 0.5 * parts < found["total"] < 1.5 * parts
 
 
+def test_light_is_right_in_sum(scene, transport):
+    """What an error of some percent in single pixels could hide: that all of them are too bright or too dark.
+
+    Light that leaves the glossy pixels towards the camera, all together, against ``path`` with the same factors and
+    lights. Expected: within 0.5% and three standard errors, of independent halves; a gain of 2% would be noticed.
+    """
+    references = _References(scene, transport, transport.lighting.project(scene.mitsuba.environment()))
+    (sensor,) = scene.mitsuba.sensors()
+    with _posed(sensor, 40, 0, scene.centre):
+        glossy = references.regions(sensor, 16, 1)["glossy"]
+        ratios = []
+        for seed in range(4):
+            images = references.rendered(sensor, 1024, (7, seed))
+            ours, theirs = (
+                np.sum([half[glossy].sum() for half in images[k]]) for k in ("ours", "directions")
+            )
+            ratios.append(ours / theirs)
+    error = np.std(ratios, ddof=1) / 2
+    print(f"ours / path {np.mean(ratios):.4f} +- {error:.4f}")
+    assert error < 0.002
+    assert abs(np.mean(ratios) - 1) < 0.005 + 3 * error
+
+
+def test_another_order_of_shapes(scene, transport, good):
+    """The transport of a scene whose shapes came in another order is as good: its rows are moved first."""
+    n = len(transport.albedo)
+    back = np.roll(np.arange(n), n // 3)
+    glossy = np.flatnonzero(transport.material[back] >= 0)
+    old = np.searchsorted(transport.glossy, back[glossy])
+    rows = np.concatenate([back, (n + old[:, None] * transport.terms + np.arange(transport.terms)).ravel()])
+    names = ("albedo", "areas", "tangents", "normals", "material", "vertex_keys")
+    moved = replace(
+        transport,
+        direct=transport.direct.reordered(back),
+        indirect=transport.indirect.reordered(rows),
+        **{name: getattr(transport, name)[back] for name in names},
+    )
+    assert errors(validated(scene, moved)) == pytest.approx(errors(good), rel=1e-3, abs=1e-5)
+
+
 def test_turned_tangents_are_blamed_on_transport(scene, transport, good):
     """A frame turned by 90 degrees about the normal makes the brushed ball reflect across; the references stay."""
     turned = replace(transport, tangents=np.cross(transport.normals, transport.tangents))
@@ -161,7 +203,7 @@ def test_what_cannot_be_validated(scene, transport):
         bare = build(0.5, ball={"type": "sphere", "bsdf": {"type": "phong"}})
     with pytest.raises(prt.PrtError, match="another scene"):
         validate_glossy(bare, transport)
-    own = replace(transport, scene_hash=bare.hash)
+    own = precompute_glossy(bare, LIGHTING, 1, max_depth=2, progress=False)
     with pytest.raises(prt.PrtError, match="sensor"):
         validate_glossy(bare, own)
     with pytest.raises(prt.PrtError, match="environment"):
