@@ -4,10 +4,12 @@ import sys as _sys
 from pathlib import Path as _Path
 
 from .errors import PrtError, PrtWarning
+from .threads import wait_passively
 from .variant import choose_variant, variant
 
 __version__ = "0.1.0"
 
+wait_passively()  # before any compiled function runs
 try:
     choose_variant()  # before any module that uses Mitsuba's types
 except PrtError as _error:

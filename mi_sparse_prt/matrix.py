@@ -308,7 +308,8 @@ class Factored:
         return sum(factor.nbytes for factor in (*self.left, *self.right))
 
     def rows(self, ids: Rows) -> NDArray[np.float32]:
-        return np.stack([a[ids] @ b for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+        channels = [a[ids] @ b for a, b in zip(self.left, self.right, strict=True)]
+        return np.stack(channels, axis=-1) if len(channels) > 1 else channels[0][..., None]
 
     def columns(self, ids: Rows) -> NDArray[np.float32]:
         return np.stack([a @ b[:, ids] for a, b in zip(self.left, self.right, strict=True)], axis=-1)

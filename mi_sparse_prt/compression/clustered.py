@@ -10,31 +10,35 @@ rows finds the clusters, the others join them. Only the bases at the end are mad
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from threading import Event
 from typing import Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
-from mi_sparse_prt.compression.cpca import Clusters, affine_space, random_mixtures, two_pass_cpca
+from mi_sparse_prt.compression.cpca import (
+    Clusters,
+    affine_space,
+    random_mixtures,
+    refined_space,
+    two_pass_cpca,
+)
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.hashing import mix
 from mi_sparse_prt.matrix import LightTransport, MeshRange
+from mi_sparse_prt.threads import overlapped
 
 COORDINATES = 192  # at most
 SAMPLE = 1024  # rows that span their space
 DENSE = 5  # one row in so many finds the clusters
+CACHED = 64  # rows at a time that stay in the cache
 EXPANDED = 64  # vertices at a time whose rows stay in the cache
 FITTED = 4096  # rows of a cluster that its basis is made of, at most
-FINAL_PASSES = 2
-WORKERS = 2  # threads that fit clusters while another expands the rows of the next
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -87,6 +91,7 @@ class SphereRows:
     def __init__(self, transport: Rows, items: Items) -> None:
         self._transport, self.items = transport, items
         self.scale = np.sqrt(transport.lighting.solid_angles).astype(np.float32)
+        self._inverse = np.float32(1) / self.scale
         self.weights = items.areas if items.areas.any() else np.ones_like(items.areas)
         self._order = np.argsort(mix(items.keys), kind="stable")
 
@@ -106,7 +111,7 @@ class SphereRows:
             white = self._transport.white_rows(self.items.rows[some].ravel())  # [row, direction, channel]
             by_channel = np.moveaxis(white, 2, 1).reshape(len(some), per_item, -1, len(self.scale))
             into = result[a : a + EXPANDED].reshape(by_channel.shape)
-            np.divide(by_channel, self.scale, out=into)
+            np.multiply(by_channel, self._inverse, out=into)
         return result
 
     def span(self) -> Floats:
@@ -115,12 +120,12 @@ class SphereRows:
         some = self.rows(ids).reshape(-1, len(self.scale))
         weights = np.repeat(self.weights[ids], len(some) // len(ids))
         random = random_mixtures(len(some), COORDINATES)
-        found: Floats = affine_space(some, weights, COORDINATES, some[:0], False, 1, random)[1]
+        found: Floats = affine_space(some, weights, COORDINATES, some[:0], False, random)[1]
         return found if len(found) else np.eye(1, some.shape[1], dtype=np.float32)  # all is black
 
     def coordinates(self, span: Floats) -> Floats:
         """Of all vertices, (n, r * channels, q) for q vectors."""
-        vectors = span.T / self.scale[:, None]
+        vectors: Floats = span.T * self._inverse[:, None]
         found = self._transport.project_white(vectors, self.items.rows.ravel())  # [row, vector, channel]
         found = np.ascontiguousarray(np.moveaxis(found, 2, 1))
         return found.reshape(len(self), self.items.shades.shape[1], len(span))
@@ -198,10 +203,10 @@ def clustered_mesh(
     coordinates = rows.coordinates(span)
     dense = rows.sample(max(-(-len(rows) // DENSE), min(len(rows), clusters * bases)))
     found = two_pass_cpca(coordinates, rows.weights, dense, clusters, bases, centred, seed)
-    return finished(rows, found, span, centred)
+    return finished(rows, found, coordinates, centred)
 
 
-def finished(rows: SphereRows, found: Clusters, span: Floats, centred: bool = True) -> MeshClusters:
+def finished(rows: SphereRows, found: Clusters, coordinates: Floats, centred: bool = True) -> MeshClusters:
     """Spaces made of the rows themselves, coefficients of all rows, and their errors; all rounded to 16 bits.
 
     Parameters
@@ -209,19 +214,13 @@ def finished(rows: SphereRows, found: Clusters, span: Floats, centred: bool = Tr
     rows : SphereRows
     found : Clusters
         In coordinates.
-    span : (q, n_directions) float32
-        What these are coordinates of.
+    coordinates : (n, r * channels, q) float32
+        Of all vertices.
     centred : bool
     """
-    spaces, sums = _Spaces(rows, found, span, centred), np.zeros(found.bases.shape[1] + 4)
-    with threadpool_limits(1, user_api="blas"), _one_thread(), ThreadPoolExecutor(WORKERS) as pool:
-        pending: deque[Future[Doubles]] = deque()
-        for c, ids, some, is_first in _blocks(rows, found):
-            while len(pending) > (WORKERS if is_first else 0):  # later blocks need the space of the first
-                sums += pending.popleft().result()  # in order: the same sums in each run
-            pending.append(pool.submit(spaces.fill, c, ids, some, is_first))
-        for future in pending:
-            sums += future.result()
+    spaces, sums = _Spaces(rows, found, coordinates, centred), np.zeros(found.bases.shape[1] + 4)
+    for more in overlapped(partial(spaces.fill, *block) for block in _blocks(rows, found)):
+        sums += more
     left, rest = np.maximum(sums[:-3], 0), sums[-3:]
     return MeshClusters(found.labels, spaces.coefficients, spaces.means, spaces.bases, left, *rest.tolist())
 
@@ -229,64 +228,72 @@ def finished(rows: SphereRows, found: Clusters, span: Floats, centred: bool = Tr
 class _Spaces:
     """The spaces of all clusters and the coefficients of all vertices, filled in block by block."""
 
-    def __init__(self, rows: SphereRows, found: Clusters, span: Floats, centred: bool) -> None:
-        self._rows, self._found, self._span, self._centred = rows, found, span, centred
-        k, b, m, lines = *found.bases.shape[:2], span.shape[1], rows.items.shades.shape[1]
+    def __init__(self, rows: SphereRows, found: Clusters, coordinates: Floats, centred: bool) -> None:
+        self._rows, self._found, self._coordinates, self._centred = rows, found, coordinates, centred
+        k, b, m, lines = *found.bases.shape[:2], len(rows.scale), rows.items.shades.shape[1]
         self.means, self.bases = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
         self.coefficients = np.zeros((len(rows), lines, b), np.float16)
-        self._random = random_mixtures(FITTED * lines, 0)
+        self._random = random_mixtures(FITTED * lines, b)
         self._squared_scale = np.square(rows.scale)
+        self._fitted = [Event() for _ in range(k)]
 
     def fill(self, c: int, ids: Indices, some: Floats, is_first: bool) -> Doubles:
-        """Take rows (n, r * channels, m) of one cluster, which are lost: what they add to ``left`` and other sums."""
+        """Take rows (n, r * channels, m) of one cluster: what they add to ``left`` and the other sums."""
         if is_first:
-            self._fit(c, ids, some.reshape(-1, some.shape[2]))
+            try:
+                self._fit(c, ids, some)
+            finally:
+                self._fitted[c].set()
+        else:
+            self._fitted[c].wait()
+        flat = some.reshape(-1, some.shape[2])
         mean, basis = self.means[c].astype(np.float32), self.bases[c].astype(np.float32)
-        shades, weights = self._rows.items.shades[ids], self._rows.weights[ids].astype(np.float64)
-        squares, norms = _squares(some, self._squared_scale)
-        self.coefficients[ids] = some @ basis.T - mean @ basis.T
+        if not is_first:
+            self.coefficients[ids] = (flat @ basis.T - basis @ mean).reshape(*some.shape[:2], -1)
         along = self.coefficients[ids].astype(np.float32)
-        one = np.ones((*along.shape[:2], 1), np.float32)
-        some -= np.concatenate([along, one], axis=2) @ np.concatenate([basis, mean[None]])
-        errors, left_out = _squares(some, self._squared_scale)
+        ones = np.ones((len(flat), 1), np.float32)
+        points = np.concatenate([along.reshape(len(flat), -1), ones], axis=1)
+        sums = _squares(flat, points, np.concatenate([basis, mean[None]]), self._squared_scale)
+        sums = sums.reshape(4, *some.shape[:2])
+        weights, shades = self._rows.weights[ids].astype(np.float64), self._rows.items.shades[ids]
         kept = np.square(along, dtype=np.float64).sum(axis=1)[:, ::-1]  # [vertex, vector], the last one first
-        parts = np.column_stack([errors.sum(axis=1), kept])
+        parts = np.column_stack([sums[1].sum(axis=1), kept])
         more = np.cumsum(parts, axis=1)[:, ::-1]  # [vertex, vectors that count]
-        rest = weights @ squares.sum(axis=1), (shades * left_out).sum(), (shades * norms).sum()
+        rest = weights @ sums[0].sum(axis=1), (shades * sums[3]).sum(), (shades * sums[2]).sum()
         return np.concatenate([weights @ more, rest])
 
-    def _fit(self, c: int, ids: Indices, rows: Floats) -> None:
-        weights = np.repeat(self._rows.weights[ids], len(rows) // len(ids))
-        start, b = self._found.bases[c] @ self._span, self.bases.shape[1]
-        mean, basis = affine_space(rows, weights, b, start, self._centred, FINAL_PASSES, self._random)
+    def _fit(self, c: int, ids: Indices, some: Floats) -> None:
+        """What the coordinates know of the components is where the rows begin; chance, where they know nothing."""
+        rows = some.reshape(-1, some.shape[2])
+        weights = np.repeat(self._rows.weights[ids], some.shape[1])
+        away = self._coordinates[ids].reshape(len(rows), -1) - self._found.means[c]
+        products, unknown = away @ self._found.bases[c].T, ~self._found.bases[c].any(axis=1)
+        products[:, unknown] = self._random[: len(rows), : unknown.sum()]
+        mean, basis, along = refined_space(rows, weights, products, self._centred)
         self.means[c], self.bases[c, : len(basis)] = mean, basis
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let kernels that this thread calls use no others: theirs would wait busily for the next one."""
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(threads)
+        self.coefficients[ids, :, : len(basis)] = along.reshape(*some.shape[:2], -1)
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _squares(rows: Floats, weights: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums (n, channels) of squares along rows (n, channels, m), and of squares times weights (m,)."""
-    n, channels, m = rows.shape
-    plain, weighted = np.empty((n, channels)), np.empty((n, channels))
-    for i in range(n):
-        for c in range(channels):
-            a, b = np.float32(0), np.float32(0)
-            for j in range(m):
-                square = rows[i, c, j] * rows[i, c, j]
-                a += square
-                b += square * weights[j]
-            plain[i, c], weighted[i, c] = a, b
-    return plain, weighted
+def _squares(rows: Floats, along: Floats, space: Floats, weights: Floats) -> Doubles:
+    """Sums of squares of rows (n, m), and of what is left of them: (4, n).
+
+    Of rows and of differences to along (n, b) @ space (b, m); then of both, times weights (m,).
+    """
+    sums = np.zeros((4, len(rows)))
+    for first in range(0, len(rows), CACHED):
+        points = np.dot(along[first : first + CACHED], space)
+        for i in range(len(points)):
+            a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for j in range(rows.shape[1]):
+                row = rows[first + i, j]
+                left = row - points[i, j]
+                a += row * row
+                b += left * left
+                c += row * row * weights[j]
+                d += left * left * weights[j]
+            sums[0, first + i], sums[1, first + i], sums[2, first + i], sums[3, first + i] = a, b, c, d
+    return sums
 
 
 def _blocks(rows: SphereRows, found: Clusters) -> Iterator[tuple[int, Indices, Floats, bool]]:

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+
+from mi_sparse_prt.threads import one_blas_thread
 
 ITERATIONS = 1  # of assigning and fitting, for each basis vector
 SETTLING = 4  # of them, at the beginning without basis vectors, and at the end with all
 CANDIDATES = 4  # clusters that an item may go to until all are compared again ...
 COMPARED = 6  # ... which is when this many basis vectors were added
 MORE = 4  # vectors that the search for principal components carries along
-PASSES = 1  # over the rows
 BLOCK = 1 << 22  # products with all clusters at a time
 NEGLIGIBLE = 1e-6  # of the first singular value: what is smaller is rounding
 COUNTED = 1e6  # squares of singular values within this factor of it are looked at twice
@@ -161,9 +161,7 @@ def seeded(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: in
     return Clusters(np.zeros(len(rows), np.int64), centres, empty)
 
 
-def fitted(
-    rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool, passes: int = PASSES
-) -> Clusters:
+def fitted(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
     """Means and principal components of clusters whose labels are given; the old ones are where the search begins.
 
     Empty clusters are given the items that are farthest from theirs, as long as these have any error, and disappear
@@ -177,8 +175,8 @@ def fitted(
     turns = np.concatenate([sizes[::2], sizes[1::2]])  # threads take halves
     start = np.ascontiguousarray(clusters.bases[:, :bases])
     random = random_mixtures(counts.max() * rows.shape[1], bases - start.shape[1])
-    with threadpool_limits(1, user_api="blas"):
-        means, vectors = _fitted(rows, weights, order, ends, turns, start, bases, centred, passes, random)
+    with one_blas_thread():
+        means, vectors = _fitted(rows, weights, order, ends, turns, start, bases, centred, random)
     return Clusters(clusters.labels, means, vectors)
 
 
@@ -197,7 +195,6 @@ def _fitted(
     start: Floats,
     bases: int,
     centred: bool,
-    passes: int,
     random: Floats,
 ) -> tuple[Floats, Floats]:
     """``affine_space`` of all clusters; the items of cluster c are ``order[ends[c - 1] : ends[c]]``."""
@@ -212,65 +209,101 @@ def _fitted(
         )
         for i in range(len(own)):
             own[i], shares[i] = rows[order[first + i // g], i % g], weights[order[first + i // g]]
-        mean, found = affine_space(own, shares, bases, start[c], centred, passes, random)
+        mean, found = affine_space(own, shares, bases, start[c], centred, random)
         means[c], vectors[c, : len(found)] = mean, found
     return means, vectors
 
 
 @numba.njit(nogil=True, cache=True)
 def affine_space(
-    rows: Floats, weights: Floats, bases: int, start: Floats, centred: bool, passes: int, random: Floats
+    rows: Floats, weights: Floats, bases: int, start: Floats, centred: bool, random: Floats
 ) -> tuple[Floats, Floats]:
     """Mean (m,) and principal components (at most ``bases``, m) of weighted rows (n, m).
 
-    Exact if rows are no more than these, else by subspace iteration from ``start`` (any, m) and combinations of rows
-    with random coefficients (>= n, any) (Halko, Martinsson and Tropp 2011, algorithm 4.4). Deviations from the mean
-    are never formed.
+    Exact if rows are no more than these, else by a step of subspace iteration from ``start`` (any, m) and combinations
+    of rows with random coefficients (>= n, any) (Halko, Martinsson and Tropp 2011, algorithm 4.4). Deviations from the
+    mean are never formed.
     """
     n, m = rows.shape
-    share = weights / np.float32(max(weights.sum(), np.float32(1e-30)))
-    roots = np.sqrt(share)
-    mean = np.dot(share, rows) if centred else np.zeros(m, np.float32)
+    roots, mean = _centre(rows, weights, centred)
+    none = np.zeros((0, m), np.float32)
     if bases == 0:
-        return mean, np.zeros((0, m), np.float32)
+        return mean, none
     if n <= bases + MORE:
         vectors = _combined(rows, roots, mean, np.eye(n).astype(np.float32))
     else:
         mixed = _combined(rows, roots, mean, np.ascontiguousarray(random[:n]))
-        vectors = np.concatenate((start, mixed))
-        for _ in range(passes):
-            vectors = _combined(rows, roots, mean, _along(rows, roots, mean, _orthonormal(vectors)))
-    vectors = _orthonormal(vectors)
-    products = _along(rows, roots, mean, vectors).astype(np.float64)
-    values, turn = np.linalg.eigh(np.dot(products.T, products))
-    least = NEGLIGIBLE**2 * (values.max() if len(values) else 0.0)
-    if (values <= COUNTED * least).any() or len(values) < bases:  # what rounding leaves of equal rows
-        least = max(least, NEGLIGIBLE**2 * np.abs(rows).max() ** 2)
-    kept = min(bases, (values > least).sum())  # the last ones
-    turned = np.ascontiguousarray(turn[:, len(values) - kept :][:, ::-1].T.astype(np.float32))
+        vectors = _added(np.concatenate((start, mixed)), none)
+        vectors = _combined(rows, roots, mean, _weighted(roots, _along(rows, mean, vectors)))
+    vectors = _added(vectors, none)
+    turned = _principal(_weighted(roots, _along(rows, mean, vectors)), bases, np.abs(rows).max())
     return mean, np.dot(turned, vectors)
 
 
 @numba.njit(nogil=True, cache=True)
-def _along(rows: Floats, roots: Floats, mean: Floats, vectors: Floats) -> Floats:
-    """Products (n, b) of weighted deviations with vectors (b, m)."""
-    found = np.dot(rows, vectors.T)
-    offset = np.dot(vectors, mean)
-    for i in range(len(found)):
-        for k in range(len(offset)):
-            found[i, k] = roots[i] * (found[i, k] - offset[k])
-    return found
+def refined_space(
+    rows: Floats, weights: Floats, products: Floats, centred: bool
+) -> tuple[Floats, Floats, Floats]:
+    """``affine_space`` by two steps, both kept (block Krylov iteration: Musco and Musco 2015, algorithm 2).
+
+    Parameters
+    ----------
+    rows : (n, m) float32
+    weights : (n,) float32
+    products : (n, b) float32
+        Of deviations with b vectors that are nearly the components, up to factors.
+    centred : bool
+
+    Returns
+    -------
+    mean : (m,) float32
+    components : (at most b, m) float32
+    coefficients : (n, at most b) float32
+    """
+    bases = products.shape[1]
+    roots, mean = _centre(rows, weights, centred)
+    none = np.zeros((0, rows.shape[1]), np.float32)
+    if bases == 0:
+        return mean, none, np.zeros((len(rows), 0), np.float32)
+    if len(rows) <= bases + MORE:
+        vectors = _added(_combined(rows, roots, mean, np.eye(len(rows)).astype(np.float32)), none)
+        along = _along(rows, mean, vectors)
+        turned = _principal(_weighted(roots, along), bases, np.abs(rows).max())
+        return mean, np.dot(turned, vectors), np.dot(along, turned.T)
+    first = _added(_combined(rows, roots, mean, _weighted(roots, products)), none)
+    along = _along(rows, mean, first)
+    second = _added(_combined(rows, roots, mean, _weighted(roots, along)), first)
+    more = _along(rows, mean, second)
+    both = np.concatenate((along, more), axis=1)
+    turned = _principal(_weighted(roots, both), bases, np.abs(rows).max())
+    one, other = np.ascontiguousarray(turned[:, : len(first)]), np.ascontiguousarray(turned[:, len(first) :])
+    return mean, np.dot(one, first) + np.dot(other, second), np.dot(both, turned.T)
+
+
+@numba.njit(nogil=True, cache=True)
+def _centre(rows: Floats, weights: Floats, centred: bool) -> tuple[Floats, Floats]:
+    """Square roots (n,) of what rows count, of 1 together, and their mean (m,), or the origin."""
+    share = weights / np.float32(max(weights.sum(), np.float32(1e-30)))
+    return np.sqrt(share), np.dot(share, rows) if centred else np.zeros(rows.shape[1], np.float32)
+
+
+@numba.njit(nogil=True, cache=True)
+def _along(rows: Floats, mean: Floats, vectors: Floats) -> Floats:
+    """Products (n, b) of deviations with vectors (b, m)."""
+    return np.dot(rows, vectors.T) - np.dot(vectors, mean)
+
+
+@numba.njit(nogil=True, cache=True)
+def _weighted(roots: Floats, products: Floats) -> Floats:
+    """Rows of products (n, b), times their roots."""
+    return roots.reshape(-1, 1) * products
 
 
 @numba.njit(nogil=True, cache=True)
 def _combined(rows: Floats, roots: Floats, mean: Floats, products: Floats) -> Floats:
     """Weighted deviations in combinations (n, b): (b, m)."""
-    weighted = np.empty_like(products)
-    sums = np.zeros(products.shape[1], np.float32)
-    for i in range(len(products)):
-        for k in range(len(sums)):
-            weighted[i, k] = roots[i] * products[i, k]
-            sums[k] += weighted[i, k]
+    weighted = _weighted(roots, products)
+    sums = weighted.sum(axis=0)
     found = np.dot(weighted.T, rows)
     for k in range(len(sums)):
         for j in range(len(mean)):
@@ -279,14 +312,34 @@ def _combined(rows: Floats, roots: Floats, mean: Floats, products: Floats) -> Fl
 
 
 @numba.njit(nogil=True, cache=True)
-def _orthonormal(vectors: Floats) -> Floats:
-    """An orthonormal basis (at most b, m) of vectors (b, m); what depends on others within rounding is left out."""
-    wide = vectors.astype(np.float64)
+def _added(vectors: Floats, basis: Floats) -> Floats:
+    """What vectors (b, m) add to an orthonormal basis (any, m): orthonormal vectors (at most b, m).
+
+    What depends on others within rounding is left out.
+    """
+    wide, old = vectors.astype(np.float64), basis.astype(np.float64)
+    least = NEGLIGIBLE**2 * np.square(wide).sum()
+    for _ in range(2 if len(old) else 0):  # the second time for what rounding left
+        wide -= np.dot(np.dot(wide, old.T), old)
     squares, turn = np.linalg.eigh(np.dot(wide, wide.T))
-    largest = squares.max() if len(squares) else 0.0
-    kept = (squares > max(NEGLIGIBLE**2 * largest, 1e-36)).sum()
+    kept = (squares > max(least, 1e-36)).sum()
     turn = turn[:, len(squares) - kept :] / np.sqrt(squares[len(squares) - kept :])
     return np.dot(np.ascontiguousarray(turn.T), wide).astype(np.float32)
+
+
+@numba.njit(nogil=True, cache=True)
+def _principal(products: Floats, bases: int, largest: float) -> Floats:
+    """Combinations (at most ``bases``, b) of orthonormal vectors that are principal components.
+
+    products : (n, b), of weighted deviations with the vectors; largest : of the rows' elements.
+    """
+    wide = products.astype(np.float64)
+    values, turn = np.linalg.eigh(np.dot(wide.T, wide))
+    least = NEGLIGIBLE**2 * (values.max() if len(values) else 0.0)
+    if (values <= COUNTED * least).any() or len(values) < bases:  # what rounding leaves of equal rows
+        least = max(least, NEGLIGIBLE**2 * largest**2)
+    kept = min(bases, (values > least).sum())  # the last ones
+    return np.ascontiguousarray(turn[:, len(values) - kept :][:, ::-1].T.astype(np.float32))
 
 
 def nearest_clusters(rows: Floats, clusters: Clusters, count: int) -> Indices:

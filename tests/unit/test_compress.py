@@ -80,8 +80,7 @@ def test_factors_give_the_clusters_of_the_expanded_matrix() -> None:
     other = settled(coordinates, rows.weights, lifted, 5, True)
     np.testing.assert_array_equal(one.labels, other.labels)
     errors = [
-        finished(rows, found, base_of).left[-1]
-        for found, base_of in ((other, span), (one, np.eye(96, dtype=np.float32)))
+        finished(rows, found, values).left[-1] for found, values in ((other, coordinates), (one, explicit))
     ]
     energy = (rows.weights * np.square(explicit).sum(axis=(1, 2))).sum()
     assert abs(np.sqrt(errors[0] / energy) - np.sqrt(errors[1] / energy)) < 1e-4

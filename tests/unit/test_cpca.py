@@ -13,6 +13,7 @@ from mi_sparse_prt.compression.cpca import (
     nearest_clusters,
     random_mixtures,
     reassigned,
+    refined_space,
     seeded,
     settled,
     squared_distances,
@@ -65,13 +66,49 @@ def test_rows_in_affine_spaces_are_found(g: int) -> None:
 @pytest.mark.parametrize("shape", [(300, 40), (30, 200), (500, 300)])
 def test_principal_components_are_singular_vectors(shape: tuple[int, int]) -> None:
     """What is left out is within half a per cent of the least that is possible."""
-    rng = np.random.default_rng(1)
-    rows = (rng.standard_normal(shape) @ np.diag(0.9 ** np.arange(shape[1]))).astype(np.float32)
-    start, random = np.zeros((0, shape[1]), np.float32), random_mixtures(500, 8)
-    _, vectors = affine_space(rows, equal(len(rows)), 8, start, False, 6, random)
+    rows = decaying(shape)
+    vectors, random = np.zeros((0, shape[1]), np.float32), random_mixtures(500, 8)
+    for _ in range(6):
+        _, vectors = affine_space(rows, equal(len(rows)), 8, vectors, False, random)
     np.testing.assert_allclose(vectors @ vectors.T, np.eye(8), atol=1e-5)
     left = np.square(rows - rows @ vectors.T @ vectors).sum()
     assert left <= 1.005 * np.square(np.linalg.svd(rows, compute_uv=False)[8:]).sum()
+
+
+def decaying(shape: tuple[int, int]) -> np.ndarray:
+    """Random rows of singular values that fall slowly."""
+    noise = np.random.default_rng(1).standard_normal(shape)
+    return (noise @ np.diag(0.9 ** np.arange(shape[1]))).astype(np.float32)
+
+
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize("shape", [(300, 40), (10, 200), (500, 300)])
+def test_two_steps_refine_what_a_part_of_the_columns_tells(shape: tuple[int, int], centred: bool) -> None:
+    """From components of a third of the columns to those of all, with weights; coefficients belong to them."""
+    rows, weights = decaying(shape) + 0.3, np.random.default_rng(2).random(shape[0]).astype(np.float32)
+    roots = np.sqrt(weights / weights.sum())[:, None]
+    away = rows - (roots.T**2 @ rows if centred else 0)
+    known = np.linalg.svd(roots * away[:, ::3], full_matrices=False)[2][:8]
+    products = (away[:, ::3] @ known.T).astype(np.float32)
+    mean, vectors, along = refined_space(rows, weights, products, centred)
+    np.testing.assert_allclose(mean, (rows - away)[0], atol=1e-5)
+    np.testing.assert_allclose(vectors @ vectors.T, np.eye(8), atol=1e-5)
+    np.testing.assert_allclose(along, away @ vectors.T, atol=1e-4)
+    left = np.square(roots * (away - along @ vectors)).sum()
+    least = np.square(np.linalg.svd(roots * away, compute_uv=False)[8:]).sum()
+    assert left <= 1.02 * least + 1e-8
+    without = np.square(np.linalg.norm(roots * away)) - np.square(roots * products).sum()
+    assert without > 1.2 * least or shape[0] == 10  # there was something to refine
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3])
+def test_rows_of_few_dimensions_have_no_more_components(rank: int) -> None:
+    rng = np.random.default_rng(3)
+    rows = (rng.standard_normal((60, rank)) @ rng.standard_normal((rank, 90))).astype(np.float32)
+    products = rng.standard_normal((60, 6)).astype(np.float32)
+    _, vectors, along = refined_space(rows, equal(60), products, False)
+    assert len(vectors) == along.shape[1] == rank
+    np.testing.assert_allclose(along @ vectors, rows, atol=1e-5)
 
 
 def test_nearest_clusters_are_those_of_all_distances() -> None:
