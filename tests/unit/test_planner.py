@@ -173,7 +173,7 @@ def test_gathering_learns_its_bias(grey_scene):
 
 
 def test_noise_of_rays_is_not_worth_a_rank():
-    """A tolerance of what the noise is stands beside the finest one, where that is less by more than a little."""
+    """Tolerances of what the noise is, and of twice that, stand beside the finest one, where it is clearly less."""
 
     def costs(noise: float) -> GatherCosts:
         spectra = np.zeros((2, 4))
@@ -181,10 +181,11 @@ def test_noise_of_rays_is_not_worth_a_rank():
             100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, {64: noise, 256: noise / 2}, 0.0, 0.1, 1.2, spectra
         )
 
-    assert costs(0.02).tolerances(64, 0.06) == (0.06, 0.2)
-    assert costs(0.02).tolerances(256, 0.03) == (0.03, 0.1)
-    assert costs(0.02).tolerances(1024, 0.06) == (0.06,)
-    assert costs(0.007).tolerances(64, 0.06) == (0.06,)
+    assert costs(0.02).tolerances(64, 0.06) == (0.06, 0.2, 0.4)
+    assert costs(0.02).tolerances(256, 0.03) == (0.03, 0.1, 0.2)
+    assert costs(0.02).tolerances(1024, 0.06) == (0.06, 0.1)
+    assert costs(0.007).tolerances(64, 0.06) == (0.06, 0.14)
+    assert costs(0.0035).tolerances(64, 0.06) == (0.06,)
     assert costs(0.2).tolerances(64, 0.06) == (0.06,)  # more noise than light: nothing is to be told from it
 
 

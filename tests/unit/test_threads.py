@@ -1,0 +1,77 @@
+"""How libraries share the cores: order, errors and limits of overlapped tasks; what importing the package sets."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import numba
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from mi_sparse_prt.blocks import MADE, rows_times
+from mi_sparse_prt.threads import overlapped
+
+
+def test_results_come_in_the_order_of_their_tasks() -> None:
+    def late_first(i: int) -> int:
+        time.sleep(0.02 * (i % 3 == 0))
+        return i
+
+    assert list(overlapped(lambda i=i: late_first(i) for i in range(20))) == list(range(20))
+
+
+def test_tasks_run_beside_the_thread_that_prepares_the_next() -> None:
+    """The first one waits for what happens when the second one is made."""
+    second_is_made = threading.Event()
+
+    def tasks():
+        yield lambda: second_is_made.wait(10)
+        second_is_made.set()
+        yield lambda: True
+
+    assert list(overlapped(tasks())) == [True, True]
+
+
+def test_an_error_in_a_task_is_raised_and_threads_are_given_back() -> None:
+    before = numba.get_num_threads(), [p["num_threads"] for p in threadpool_info()]
+
+    def tasks():
+        for i in range(6):
+            yield lambda i=i: 1 // (i - 2)
+
+    with pytest.raises(ZeroDivisionError):
+        list(overlapped(tasks()))
+    assert (numba.get_num_threads(), [p["num_threads"] for p in threadpool_info()]) == before
+
+
+def test_products_and_kernels_use_one_thread_meanwhile() -> None:
+    def limits() -> list[int]:
+        return [p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"]
+
+    def tasks():
+        yield limits
+        assert numba.get_num_threads() == 1
+
+    (found,) = overlapped(tasks())
+    assert found and set(found) == {1}
+
+
+@pytest.mark.parametrize("count", [0, 1, MADE, 2 * MADE + 3])
+def test_rows_are_multiplied_in_their_order(count: int) -> None:
+    rng = np.random.default_rng(0)
+    rows, vectors = (rng.random(shape, np.float32) for shape in ((count, 20), (20, 3)))
+    found = rows_times(lambda ids: rows[ids][..., None], count, vectors)
+    np.testing.assert_allclose(found[..., 0], rows @ vectors, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "passive"), ("active", "active")])
+def test_waiting_threads_sleep_unless_they_are_told_otherwise(given: str | None, expected: str) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
+    if given:
+        environment["OMP_WAIT_POLICY"] = given
+    code = "import os, mi_sparse_prt; print(os.environ['OMP_WAIT_POLICY'])"
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.stdout.split() == [expected], run.stderr
