@@ -233,7 +233,7 @@ class _Spaces:
         k, b, m, lines = *found.bases.shape[:2], len(rows.scale), rows.items.shades.shape[1]
         self.means, self.bases = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
         self.coefficients = np.zeros((len(rows), lines, b), np.float16)
-        self._random = random_mixtures(FITTED * lines, b)
+        self._random = random_mixtures(min(len(rows), FITTED) * lines, b)
         self._squared_scale = np.square(rows.scale)
         self._fitted = [Event() for _ in range(k)]
 
