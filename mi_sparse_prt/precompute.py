@@ -19,7 +19,7 @@ from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.parts import Parts
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import forecast
-from mi_sparse_prt.planner.pilot import FEW_JUDGES, measure
+from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.plan import Plan
 from mi_sparse_prt.planner.proposals import Ladder, Ranking, ladder
 from mi_sparse_prt.scene import Scene
@@ -199,23 +199,14 @@ def _attempted(
     while settings.target_error is not None:
         with clock.phase("held_out"):
             transport = evaluation.matrix(attempts[-1])
-            error = _judged(scene, transport, settings, settings.seed + _JUDGES + len(attempts) - 1)
-        if error <= settings.target_error or not proposals.after(error):
+            judge = settings.seed + _JUDGES + len(attempts) - 1
+            found = held_out_error(scene, transport, settings.max_depth, judge, settings.target_error)
+        if found["total"] <= settings.target_error or not proposals.after(found["total"]):
             break
         if evaluation.progress:
-            tqdm.write(_again(error, proposals.plan, proposals.seconds))
+            tqdm.write(_again(found["total"], proposals.plan, proposals.seconds))
         attempts.append(evaluation.parts(proposals.plan))
     return _with_costs_of(attempts)
-
-
-def _judged(scene: Scene, transport: LightTransport, settings: Settings, seed: int) -> float:
-    """The error of a matrix, from few held-out elements if these leave no doubt whether it meets the target."""
-    assert settings.target_error is not None
-    for effort in (FEW_JUDGES, 1.0):
-        found = held_out_error(scene, transport, settings.max_depth, seed, effort)
-        if abs(found["total"] - settings.target_error) > 2 * found["standard_error"]["total"]:
-            break
-    return float(found["total"])
 
 
 def _with_costs_of(attempts: list[Parts]) -> Parts:

@@ -34,7 +34,9 @@ POOL = 8  # times as many, of which these are drawn
 EVEN = 0.2  # of them drawn without regard to the light that the matrix has there
 
 MEAN_COSINE = 0.25  # of max(0, n . w) over the sphere
-BLOCK = 1 << 14  # vertices at a time: some hundred trials each
+BLOCK = 1 << 12  # vertices at a time: some hundred trials each
+
+_NO_EDGES = np.zeros((0, 0), np.uint32), np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True)
@@ -79,21 +81,15 @@ def for_direct_light(
     """
     lighting, part = transport.lighting, transport.direct
     rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
-    floor = 0.0
+    floor, edges = 0.0, _NO_EDGES
     if not isinstance(part, Visibility):
         rays, floor = rays / FEW, BELOW_HORIZON
-    if not isinstance(part, Visibility | FractionalVisibility):
-        return _by_cosine(lighting, normals, inside, rays, floor, rng)
-    drawn = rays / (NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES)
-    found = _by_cosine(lighting, normals, inside, drawn, floor, rng)
-    nearest = min(AROUND + 1, lighting.n_directions)
-    around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
-    near = _near_edges(
-        part.bits, normals, lighting.directions, around.astype(np.int32), found.vertices, found.texels
-    )
-    kept = near | (rng.random(len(near)) < FAR_FROM_EDGES)
-    weights = found.weights / np.where(near, 1.0, FAR_FROM_EDGES)
-    return Chosen(found.vertices[kept], found.texels[kept], weights[kept])
+    if isinstance(part, Visibility | FractionalVisibility):
+        rays /= NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES
+        nearest = min(AROUND + 1, lighting.n_directions)
+        around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
+        edges = part.bits[inside], around.astype(np.int32)
+    return _by_cosine(lighting, normals[inside], inside.start, rays, floor, edges, rng)
 
 
 def rays_of(total: int) -> float:
@@ -139,25 +135,28 @@ def for_indirect_light(
 def _by_cosine(
     lighting: CubemapLighting,
     normals: NDArray[np.float32],
-    inside: slice,
+    first: int,
     count: float,
     floor: float,
+    edges: tuple[Bits, NDArray[np.int32]],
     rng: np.random.Generator,
 ) -> Chosen:
-    """About ``count`` elements, drawn by (cosine + floor) x solid angle: random texels, kept or rejected by that."""
+    """About ``count`` elements, drawn by (cosine + floor) x solid angle: random texels, kept or rejected by that.
+
+    Of those far from edges (bits, texels around each) few are kept. Vertices are counted from ``first`` on.
+    """
     directions, areas = lighting.directions, lighting.solid_angles / lighting.solid_angles.max()
-    n, parts = inside.stop - inside.start, []
+    n, (bits, around), parts = len(normals), edges, []
     trials = max(1, round(count * (1 + floor) / (float(areas.mean()) * (MEAN_COSINE + floor) * n)))
     seeds = rng.integers(1 << 63, size=n, dtype=np.uint64)
     for a in range(0, n, BLOCK):
         block = slice(a, min(a + BLOCK, n))
-        found = _kept(normals[inside][block], directions, areas, floor, trials, seeds[block])
-        vertex, trial = np.nonzero(found >= 0)
-        parts.append((inside.start + a + vertex, found[vertex, trial].astype(np.int64)))
-    vertices, texels = (np.concatenate(column) for column in zip(*parts, strict=True))
-    cosine = np.einsum("md,md->m", normals[vertices], directions[texels]).astype(np.float64)
-    probability = areas[texels] * (np.maximum(cosine, 0) + floor) / (1 + floor)
-    return Chosen(vertices, texels, lighting.n_directions / (trials * np.maximum(probability, 1e-12)))
+        texels, weights, counts = _kept(
+            normals[block], directions, areas, floor, bits[block], around, trials, seeds[block]
+        )
+        vertices = np.repeat(np.arange(first + a, first + block.stop), counts)
+        parts.append((vertices, *_packed(texels, weights, counts)))
+    return Chosen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 @numba.njit(parallel=True, cache=True)
@@ -166,24 +165,71 @@ def _kept(
     directions: NDArray[np.float32],
     areas: NDArray[np.float32],
     floor: float,
+    bits: Bits,
+    around: NDArray[np.int32],
     trials: int,
     seeds: NDArray[np.uint64],
-) -> NDArray[np.int32]:
-    """Texel of each trial of each vertex, (n, trials), -1 where it is rejected."""
-    found = np.full((len(normals), trials), -1, np.int32)
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    """Texels and weights of the trials of each vertex that are kept, (n, trials), and how many these are, (n,)."""
+    texels, weights = np.empty((len(normals), trials), np.int32), np.empty((len(normals), trials))
+    counts = np.zeros(len(normals), np.int64)
     for i in numba.prange(len(normals)):
         state = seeds[i]
-        for k in range(trials):
+        for _ in range(trials):
             state += np.uint64(0x9E3779B97F4A7C15)
-            bits = _mixed(state)
-            texel = int(((bits >> np.uint64(32)) * np.uint64(len(directions))) >> np.uint64(32))
-            uniform = (bits & np.uint64(0xFFFFFFFF)) / 2.0**32
-            cosine = 0.0
-            for d in range(3):
-                cosine += normals[i, d] * directions[texel, d]
-            if uniform * (1 + floor) < areas[texel] * (max(cosine, 0.0) + floor):
-                found[i, k] = texel
-    return found
+            random = _mixed(state)
+            texel = int(((random >> np.uint64(32)) * np.uint64(len(directions))) >> np.uint64(32))
+            uniform = (random & np.uint64(0xFFFFFFFF)) / 2.0**32
+            probability = (
+                areas[texel] * (max(_cosine(normals[i], directions[texel]), 0.0) + floor) / (1 + floor)
+            )
+            if uniform >= probability:
+                continue
+            # what was below the probability is uniform again, relative to it
+            if len(around) and not _near_edge(bits[i], normals[i], directions, texel, around[texel]):
+                if uniform >= FAR_FROM_EDGES * probability:
+                    continue
+                probability *= FAR_FROM_EDGES
+            texels[i, counts[i]] = texel
+            weights[i, counts[i]] = len(directions) / (trials * probability)
+            counts[i] += 1
+    return texels, weights, counts
+
+
+@numba.njit(cache=True)
+def _packed(
+    texels: NDArray[np.int32], weights: NDArray[np.float64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The first of each row's values, as many as counted, one row after another."""
+    total, a = counts.sum(), 0
+    flat, weight = np.empty(total, np.int64), np.empty(total)
+    for i in range(len(counts)):
+        b = a + counts[i]
+        flat[a:b] = texels[i, : counts[i]]
+        weight[a:b] = weights[i, : counts[i]]
+        a = b
+    return flat, weight
+
+
+@numba.njit
+def _cosine(normal: NDArray[np.float32], direction: NDArray[np.float32]) -> float:
+    return normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2]
+
+
+@numba.njit
+def _near_edge(
+    bits: Bits,
+    normal: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    texel: int,
+    around: NDArray[np.int32],
+) -> bool:
+    """Whether a bit differs from one of those around it; below the horizon there is nothing to differ from."""
+    own = bit_of(bits, texel)
+    for j in around:
+        if bit_of(bits, j) != own and _cosine(normal, directions[j]) > 0:
+            return True
+    return False
 
 
 @numba.njit
@@ -192,28 +238,3 @@ def _mixed(x: np.uint64) -> np.uint64:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
-
-
-@numba.njit(parallel=True, cache=True)
-def _near_edges(
-    bits: Bits,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    around: NDArray[np.int32],
-    vertices: NDArray[np.int64],
-    texels: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Whether a bit differs from one of those around it, (m,); below the horizon there is nothing to differ from."""
-    near = np.zeros(len(vertices), np.bool_)
-    for e in numba.prange(len(vertices)):
-        i = vertices[e]
-        own = bit_of(bits[i], texels[e])
-        for j in around[texels[e]]:
-            if bit_of(bits[i], j) != own:
-                cosine = 0.0
-                for d in range(3):
-                    cosine += normals[i, d] * directions[j, d]
-                if cosine > 0:
-                    near[e] = True
-                    break
-    return near

@@ -12,7 +12,7 @@ mean, (S - m)^2 - v estimates (S - s)^2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from mi_sparse_prt.validation.elements import AnyPart, elements
 SPP = 512
 STRATA = 4  # shadow rays per axis of a texel
 ROUNDING = 1e-5  # relative errors below are those of float32
+ROUND = 0.25  # of the elements: these mostly tell whether a target is met
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,11 @@ class Sample:
     norms: NDArray[np.float64]
 
 
+Samples = dict[tuple[str, str], Sample]  # by the names of a mesh and of a part
+
+
 def held_out_error(
-    scene: Scene, transport: LightTransport, max_depth: int, seed: int, effort: float = 1.0
+    scene: Scene, transport: LightTransport, max_depth: int, seed: int, target: float | None = None
 ) -> dict[str, Any]:
     """Estimate the relative L2 error of a matrix.
 
@@ -62,29 +66,44 @@ def held_out_error(
         As for ``precompute``. Where the matrix has no indirect light, none is expected.
     seed : int
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
-    effort : float
-        Of the usual number of elements, at most 1; the standard error grows as its inverse root.
+    target : float, optional
+        Relative L2 error. If given, elements are drawn by the quarter until these leave no doubt (2 standard errors)
+        whether the error is above it.
 
     Returns
     -------
     dict
         ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes`` again,
         from the spread between elements; where no element is wrong, as if an average one were), ``elements`` (how
-        many were evaluated).
+        many were drawn).
     """
     judge, rng = _Judge(scene, transport, max_depth, seed), np.random.default_rng([seed, 1])
-    samples: dict[str, list[Sample]] = {}
-    count = 0
-    for mesh in transport.meshes:
-        lit = for_direct_light(transport, scene.normals, mesh.vertices, rng, effort)
-        samples[mesh.name] = [judge.direct(lit)]
-        seen = [lit]
-        if transport.indirect is not None:
-            seen.append(for_indirect_light(transport, mesh.vertices, rng, effort))
-            samples[mesh.name].append(judge.indirect(seen[1]))
-        count += _distinct(seen, transport.lighting.n_directions)
-    meshes = {name: relative(found) for name, found in samples.items()}
-    total = relative([sample for found in samples.values() for sample in found])
+    if target is None:
+        return _estimate(judge.samples(rng, 1.0))
+    samples: Samples = {}
+    for _ in range(round(1 / ROUND)):
+        samples = _together(samples, judge.samples(rng, ROUND))
+        found = _estimate(samples)
+        if abs(found["total"] - target) > 2 * found["standard_error"]["total"]:
+            break
+    return found
+
+
+def _together(first: Samples, second: Samples) -> Samples:
+    """Samples of which each stands for its mesh as one; weights matter relative to each other only."""
+    return {
+        key: Sample(*(np.concatenate(pair) for pair in zip(astuple(first[key]), astuple(more), strict=True)))
+        if key in first
+        else more
+        for key, more in second.items()
+    }
+
+
+def _estimate(samples: Samples) -> dict[str, Any]:
+    """Relative L2 errors and standard errors."""
+    names = dict.fromkeys(name for name, _ in samples)
+    meshes = {name: relative([sample for (of, _), sample in samples.items() if of == name]) for name in names}
+    total = relative(list(samples.values()))
     return {
         "total": total[0],
         "meshes": {name: value for name, (value, _) in meshes.items()},
@@ -92,7 +111,7 @@ def held_out_error(
             "total": total[1],
             "meshes": {name: error for name, (_, error) in meshes.items()},
         },
-        "elements": count,
+        "elements": sum(len(sample.weights) for sample in samples.values()),
     }
 
 
@@ -101,6 +120,7 @@ class _Judge:
 
     def __init__(self, scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> None:
         self._transport, self._albedo = transport, scene.albedo.astype(np.float64)
+        self._normals = scene.normals
         points, lighting = vertex_points(scene), transport.lighting
         self._seeds = [(seed << 3) + k for k in (2, 3, 4)]  # none is the matrix's own
         self._rays = DirectTransport(
@@ -116,6 +136,17 @@ class _Judge:
             1 if scene.grey else 3,
             self._seeds[2],
         )
+
+    def samples(self, rng: np.random.Generator, effort: float) -> Samples:
+        """Elements of each mesh, for direct and for indirect light."""
+        transport, samples = self._transport, {}
+        for mesh in transport.meshes:
+            lit = for_direct_light(transport, self._normals, mesh.vertices, rng, effort)
+            samples[mesh.name, "direct"] = self.direct(lit)
+            if transport.indirect is not None:
+                seen = for_indirect_light(transport, mesh.vertices, rng, effort)
+                samples[mesh.name, "indirect"] = self.indirect(seen)
+        return samples
 
     def direct(self, chosen: Chosen) -> Sample:
         """Squared errors and norms of direct light alone."""
@@ -180,9 +211,3 @@ def _variance(sample: Sample, ratio: float) -> float:
         return (float((norms**2).sum()) / max(size, 1e-300)) ** 2
     left = (squares - ratio * norms) ** 2
     return float(left.sum() + left.max())
-
-
-def _distinct(parts: list[Chosen], n_directions: int) -> int:
-    """How many different elements were chosen."""
-    places = np.sort(np.concatenate([p.vertices * n_directions + p.texels for p in parts]))
-    return int(np.count_nonzero(np.diff(places))) + bool(len(places))

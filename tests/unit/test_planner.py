@@ -3,6 +3,7 @@
 import json
 import math
 import warnings
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -80,7 +81,7 @@ def best(costs: Costs, target: float, spp: int | None = None) -> Predicted:
 
 def test_direct_light_alone_is_by_consensus_if_it_is_good_enough():
     assert best(Costs(0, BOTH), 0.02).plan == Plan("consensus")
-    assert best(Costs(0, BOTH), 0.012).plan == Plan("exact")
+    assert best(Costs(0, BOTH), 0.011).plan == Plan("exact")
     dear = BOTH | {"consensus": DirectCost(11.0, 0.012)}
     assert best(Costs(0, dear), 0.02).plan == Plan("exact")
 
@@ -103,7 +104,7 @@ def test_the_fewest_rays_that_meet_the_target():
     assert found.error == pytest.approx(math.hypot(0.012, 0.02))
     assert found.seconds == pytest.approx(4 + 2.56)
     # together they miss what each alone would meet
-    assert best(costs, 0.0234).plan == Plan("exact", "gather", *GATHER[1])
+    assert best(costs, 0.0232).plan == Plan("exact", "gather", *GATHER[1])
 
 
 def test_the_most_exact_plan_if_none_is_good_enough():
@@ -209,10 +210,24 @@ def test_a_rank_grows_as_it_did_within_the_sample():
     assert rank(100, 200) == MOST
 
 
-def test_what_is_close_to_the_target_is_judged_once_more():
-    costs = Costs(1.0, EXACT, PATHS, FakeGather(), check=3.0)
-    by_rays = {p.plan.rays: p.seconds for p in predictions(costs, 0.022) if p.plan.indirect == "gather"}
-    assert by_rays == {64: 1 + 10 + 0.64, 256: 1 + 10 + 2.56 + 3, 1024: 1 + 10 + 10.24, 4096: 1 + 10 + 40.96}
+def test_what_may_miss_the_target_costs_more():
+    """
+    Rationale: held-out elements judge by the quarter until there is no doubt; after a miss another plan follows.
+    Expected: of 64, 256, 1024 rays at 4, 2 and 1% against 2.2%, the second is judged by 2.16 quarters of the elements,
+        as two standard errors of so many are the factor to the target; and as that is one standard deviation of
+        predictions (10%), a plan that certainly meets it follows with a probability of 17%. It is chosen unless the
+        third takes less time than that.
+    """
+    costs = Costs(1.0, EXACT, PATHS, FakeGather(), check=4.0)
+    gathering = {p.plan.rays: p for p in predictions(costs, 0.022) if p.plan.indirect == "gather"}
+    seconds = {rays: p.seconds for rays, p in gathering.items()}
+    assert seconds == pytest.approx({64: 11.64, 256: 13.56 + 1.16, 1024: 21.24, 4096: 51.96}, abs=0.01)
+    risks = {rays: p.risk for rays, p in gathering.items()}
+    assert risks == pytest.approx({64: 10.24, 256: 0.17 * 10.24, 1024: 0.0, 4096: 0.0}, rel=0.01, abs=1e-3)
+    assert best(costs, 0.022).plan.rays == 256
+    assert (
+        best(replace(costs, check=9.0), 0.022).plan.rays == 1024
+    )  # 13.56 + 6.75 + 1.74 s is more than 21.24 s
 
 
 def test_direct_light_that_the_choice_depends_on_is_found_first():
@@ -224,7 +239,7 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
     """
     assert [uncertain(Costs(0, BOTH), target) for target in (0.003, 0.02, 0.05)] == [None, "consensus", None]
     assert uncertain(Costs(0, EXACT), 0.02) is None
-    for error, seconds, plan in ((0.019, 1 + 4.0, "consensus"), (0.022, 1 + 14.0, "exact")):
+    for error, seconds, plan in ((0.021, 1 + 4.0, "consensus"), (0.023, 1 + 14.0, "exact")):
         ranking = Ranking(Costs(1, BOTH, direct_share=0.9), Settings(4, target_error=0.02))
         assert ranking.uncertain == "consensus"
         ranking.judged("consensus", error)
