@@ -126,5 +126,5 @@ def _judged(target: float, auto: Report, plans: list[Report]) -> Report:
         "plan": auto["plan"],
         "best": best,
         "choice": best and own / best["seconds"],
-        "whole": best and auto["seconds"]["total"] / best["seconds"],
+        "whole": best and auto["seconds"]["total"] / best["seconds_in_all"],
     }

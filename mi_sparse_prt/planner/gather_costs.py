@@ -23,6 +23,7 @@ from mi_sparse_prt.transport.sparse_product import product
 from mi_sparse_prt.validation.pilot_elements import PilotElements
 
 FEW, MANY = 64, 256  # rays per vertex of a pilot
+PATHS = 256  # per element that tell a bias: fewer would see one of 0.5% where there is none
 TIMED = 2048  # rays per vertex, where these are timed
 SAMPLE = 256  # vertices, and as many texels, that tell the rank
 FINE = 0.03  # tolerance below which a sample tells little
@@ -143,9 +144,7 @@ class GatherCosts:
         return made + self.multiplication * dense + self.addition * sparse
 
 
-def gather_costs(
-    scene: Scene, direct: DirectTransport, held: PilotElements, max_depth: int, seed: int
-) -> GatherCosts | None:
+def gather_costs(scene: Scene, direct: DirectTransport, held: PilotElements, seed: int) -> GatherCosts | None:
     """Measure at the vertices of the held-out elements; None where light cannot be gathered.
 
     Parameters
@@ -155,8 +154,6 @@ def gather_costs(
         At all vertices.
     held : PilotElements
         With indirect light.
-    max_depth : int
-        Of the held-out elements.
     seed : int
     """
     assert held.indirect is not None
@@ -170,7 +167,7 @@ def gather_costs(
         return None
     light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]
     noise = [held.relative_square(held.weighted((a - b) ** 2 / 2)) for a, b in light]
-    first = held.indirect if max_depth == 3 else held.paths(3)
+    first = held.paths(3, PATHS)
     sizes = [held.share(light) for light in (first, held.indirect)]
     bias = _typical(held, (light[1][0] - first.values[0]) * (light[1][1] - first.values[1]))
     multiplication, addition = _seconds_of_products(direct, many[0])

@@ -66,7 +66,7 @@ def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect:
     fine, asked = lighting.resolution, settings.indirect_resolution
     costs = replace(costs, paths=path_costs(scene, settings, held, path, [asked or fine]))
     if auto:
-        costs = replace(costs, gather=gather_costs(scene, direct, held, settings.max_depth, seed))
+        costs = replace(costs, gather=gather_costs(scene, direct, held, seed))
     if auto and settings.basis == "direction" and asked in (None, fine):
         sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
         costs = replace(costs, sparse=sparse)

@@ -103,7 +103,7 @@ class PilotElements:
         whole = self.direct.values + (self.indirect.values if self.indirect else 0)
         self._norm = self._total(self._squares(*whole))
 
-    def paths(self, max_depth: int) -> Halves:
+    def paths(self, max_depth: int, spp: int = SPP) -> Halves:
         """Indirect light at these elements, up to some depth."""
         seeds = [(self._seed << 2) + k for k in (2, 3)]
         solver = PathTransport(
@@ -112,7 +112,7 @@ class PilotElements:
             vertex_points(self._scene),
             self._basis,
             max_depth,
-            SPP,
+            spp,
             1 if self._scene.grey else 3,
         )
         power = self.lighting.solid_angles[self.texels][..., None].astype(np.float64)
@@ -120,10 +120,10 @@ class PilotElements:
         for seed in seeds:
             start = time.perf_counter()  # that of the second time: the first one may have had to compile
             found = solver.elements(*self._flat, seed)
-            seconds = (time.perf_counter() - start) / (self.texels.size * SPP)
+            seconds = (time.perf_counter() - start) / (self.texels.size * spp)
             mean, square = (x.reshape(*self.texels.shape, -1) for x in (found.mean, found.variance))
             values.append(mean * power)
-            variance = variance + square * power**2 * SPP / len(seeds)
+            variance = variance + square * power**2 * spp / len(seeds)
         return Halves(np.stack(values), variance, seconds)
 
     def relative_square(self, values: Values) -> float:

@@ -13,7 +13,7 @@ from mi_sparse_prt.planner.plan import Plan
 
 
 def carried_out(plan: Plan, seconds: float, error: float) -> dict:
-    return {**plan.report(), "seconds": seconds, "estimated_error": error}
+    return {**plan.report(), "seconds": seconds, "seconds_in_all": seconds + 2, "estimated_error": error}
 
 
 def auto(plan: Plan, seconds: float, error: float) -> dict:
@@ -29,14 +29,14 @@ def test_the_best_is_the_quickest_that_is_good_enough():
     """
     Rationale: a quick plan that misses the target is no match for one that meets it.
     Expected: of three plans (1 s at 3%, 2 s at 1.9%, 5 s at 0.5%) the second is the best for 2%, the last one for 1%;
-        "auto", which takes the last one and 8 s, took 2.5 and 4 times too long for 2%; where no plan meets the target
-        there is no best one, and 2.1% +- 0.1% counts as 2%.
+        "auto", which takes the last one and 8 s, took 2.5 times too long for 2%, and twice with 2 s that it takes in
+        any case; where no plan meets the target there is no best one, and 2.1% +- 0.1% counts as 2%.
     """
     plans = [Plan("consensus", "gather", rays) for rays in (64, 256, 1024)]
     done = [carried_out(*p) for p in zip(plans, (1.0, 2.0, 5.0), (0.03, 0.019, 0.005), strict=True)]
     loose = _judged(0.02, auto(plans[2], 8.0, 0.005), done)
     assert loose["best"] == done[1]
-    assert (loose["choice"], loose["whole"], loose["met"], loose["attempts"]) == (2.5, 4.0, True, 1)
+    assert (loose["choice"], loose["whole"], loose["met"], loose["attempts"]) == (2.5, 2.0, True, 1)
     assert _judged(0.01, auto(plans[2], 8.0, 0.005), done)["choice"] == 1.0
     tight = _judged(0.001, auto(plans[2], 8.0, 0.005), done)
     assert (tight["best"], tight["choice"], tight["whole"], tight["met"]) == (None, None, None, False)
