@@ -3,9 +3,9 @@
 import sys as _sys
 from pathlib import Path as _Path
 
-from .errors import PrtError, PrtWarning
-from .threads import wait_passively
-from .variant import choose_variant, variant
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.threads import wait_passively
+from mi_sparse_prt.core.variant import choose_variant, variant
 
 __version__ = "0.1.0"
 
@@ -18,17 +18,17 @@ except PrtError as _error:
         raise SystemExit(f"mi-sparse-prt: {_error}") from None
     raise
 
-from .compression.compress import compress  # noqa: E402
-from .emission.cubemap import CubemapLighting  # noqa: E402
-from .emission.environment import Environment, load_environment  # noqa: E402
-from .glossy import GlossyTransport, precompute_glossy  # noqa: E402
-from .matrix import LightTransport  # noqa: E402
-from .plugins import register as _register_plugins  # noqa: E402
-from .precompute import precompute  # noqa: E402
-from .relighting.image import render  # noqa: E402
-from .scene import Scene, load_scene  # noqa: E402
-from .storage import load_transport  # noqa: E402
-from .validation.validate import Validation, validate  # noqa: E402
+from mi_sparse_prt.compression.compress import compress  # noqa: E402
+from mi_sparse_prt.emission.cubemap import CubemapLighting  # noqa: E402
+from mi_sparse_prt.emission.environment import Environment, load_environment  # noqa: E402
+from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy  # noqa: E402
+from mi_sparse_prt.plugins import register as _register_plugins  # noqa: E402
+from mi_sparse_prt.precompute import precompute  # noqa: E402
+from mi_sparse_prt.relighting.image import render  # noqa: E402
+from mi_sparse_prt.scene.scene import Scene, load_scene  # noqa: E402
+from mi_sparse_prt.storage import load_transport  # noqa: E402
+from mi_sparse_prt.transport import LightTransport  # noqa: E402
+from mi_sparse_prt.validation.validate import Validation, validate  # noqa: E402
 
 _register_plugins()
 

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError, PrtWarning
 from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.io.cache_folder import cache_folder
+from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.precompute import precompute
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
+from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.storage import VERSION, load_transport
-
-
-def default_folder() -> Path:
-    """``mi_sparse_prt`` in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_sparse_prt"
+from mi_sparse_prt.transport import LightTransport
 
 
 def cached_precompute(
@@ -40,7 +35,7 @@ def cached_precompute(
     scene : Scene
     lighting : CubemapLighting
     folder : Path, optional
-        Made if it does not exist; the default is ``default_folder()``. Files in it may be deleted at any time.
+        Made if it does not exist; the default is ``cache_folder()``. Files in it may be deleted at any time.
     progress : bool
     **settings
         As for ``precompute``. Together with the scene's hash they are the key of the file; the order of the scene's
@@ -50,7 +45,7 @@ def cached_precompute(
     found = _cached(
         scene,
         what,
-        folder or default_folder(),
+        folder or cache_folder(),
         lambda kept: precompute(scene, lighting, progress=progress, checkpoint_folder=kept, **settings),
     )
     assert isinstance(found, LightTransport)
@@ -69,7 +64,7 @@ def cached_glossy(
     found = _cached(
         scene,
         what,
-        folder or default_folder(),
+        folder or cache_folder(),
         lambda _: precompute_glossy(scene, lighting, progress=progress, **settings),
     )
     assert isinstance(found, GlossyTransport)

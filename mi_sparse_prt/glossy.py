@@ -18,29 +18,31 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mi_sparse_prt.blocks import rows_times
-from mi_sparse_prt.compression.clustered_rows import Clustered
-from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.errors import PrtError, PrtWarning
-from mi_sparse_prt.evaluation import Evaluation
-from mi_sparse_prt.glossy_parts import FactoredVisibility
-from mi_sparse_prt.matrix import Factored, MeshRange, Visibility, row_order
-from mi_sparse_prt.measurement.brdf_factors import (
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.methods.execution import Evaluation
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.brdf_factors import (
     BrdfFactors,
     anisotropic,
     diffuse_reflectance,
     factors_of,
     harmonic_factors,
 )
-from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables
-from mi_sparse_prt.measurement.frames import beside_vertices, frames, vertex_tangents
-from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.glossy_gather import glossy_indirect
+from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tables
+from mi_sparse_prt.reflection.frames import beside_vertices, frames, vertex_tangents
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
+from mi_sparse_prt.transport import MeshRange, row_order
 
 TERMS = 4
 RAYS = 64
@@ -85,7 +87,7 @@ class GlossyTransport:
     direct : FactoredVisibility, or Clustered
         White light of all vertices, then the terms of the glossy ones. A compressed transport has direct and indirect
         light together here.
-    indirect : Factored or None
+    indirect : LowRank or None
         The same rows.
     tangents, normals : (n_v, 3) float32, world
     material : (n_v,) int64
@@ -101,7 +103,7 @@ class GlossyTransport:
     albedo: Floats
     areas: Floats
     direct: FactoredVisibility | Clustered
-    indirect: Factored | None
+    indirect: LowRank | None
     tangents: Floats
     normals: Floats
     material: NDArray[np.int64]
@@ -263,7 +265,7 @@ def precompute_glossy(
     Parameters
     ----------
     scene : Scene
-        BSDFs are diffuse or can be factored (``measurement.brdf_factors``).
+        BSDFs are diffuse or can be factored (``reflection.brdf_factors``).
     lighting : CubemapLighting
         The direction basis is used.
     terms : int
@@ -301,7 +303,7 @@ def precompute_glossy(
     clock = Stopwatch()
     with clock.phase("setup"):
         points = vertex_points(scene)
-        solver = DirectTransport(scene.normalised, lighting, points, "direction", 2, seed)
+        solver = DirectSolver(scene.normalised, lighting, points, "direction", 2, seed)
     with clock.phase("factors"):
         material, factors, albedo = factored_materials(scene, terms, harmonics)
         tangents = vertex_tangents(scene)

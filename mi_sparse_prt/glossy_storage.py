@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import BITS
-from mi_sparse_prt.compression.clustered_rows import Clustered
+from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.glossy_parts import FactoredVisibility
-from mi_sparse_prt.matrix import Factored, MeshRange
-from mi_sparse_prt.measurement.brdf_factors import BrdfFactors, DirectionGrid
-from mi_sparse_prt.measurement.frames import frames
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid
+from mi_sparse_prt.reflection.frames import frames
+from mi_sparse_prt.transport import MeshRange
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -78,7 +79,7 @@ def read_glossy(
     lighting: CubemapLighting,
     factors: tuple[BrdfFactors, ...],
     compressed: Clustered | None,
-    indirect: Factored | None,
+    indirect: LowRank | None,
 ) -> GlossyTransport:
     """The transport; arrays of surfaces and direct light are looked at."""
     n = len(arrays["albedo"])

@@ -9,23 +9,23 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.cost import Stopwatch, peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.core.errors import PrtWarning
+from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtWarning
-from mi_sparse_prt.evaluation import Evaluation, indirect_solver
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.methods.brute_force import share_above_horizon
-from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.methods.execution import Evaluation, indirect_solver
+from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.candidates import Ladder, Ranking, ladder
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import forecast
 from mi_sparse_prt.planner.pilot import measure
-from mi_sparse_prt.planner.plan import Plan
-from mi_sparse_prt.planner.proposals import Ladder, Ranking, ladder
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.validation.held_out import held_out_error
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.transport import LightTransport
 
 _JUDGES = 1 << 20  # seeds of held-out elements that decide ...
 _DIRECT_JUDGE = _JUDGES << 1  # ... and of those that direct light alone is judged by
@@ -59,7 +59,7 @@ def precompute(
         in this scene on this machine, predicts time and error of all plans, and takes the quickest that meets the
         target error (``planner``). The others evaluate every element; few of them (``methods.sparse``); few as [HR10]
         does (``methods.huang2010``); or all direct ones, and interreflections by finite elements
-        (``transport.gather``, diffuse scenes only).
+        (``solvers.radiosity``, diffuse scenes only).
     basis : {"direction", "texel"}
         Whether a texel's light arrives from its centre alone or from its whole area.
     max_depth : int
@@ -112,7 +112,7 @@ def precompute(
     clock = Stopwatch()
     with clock.phase("setup"):
         points = vertex_points(scene)
-        direct = DirectTransport(scene.normalised, lighting, points, basis, strata, seed)
+        direct = DirectSolver(scene.normalised, lighting, points, basis, strata, seed)
     reason = _no_indirect(scene, settings, clock)
     proposals = _proposals(scene, direct, settings, reason is None, clock)
     with clock.phase("pilot"):
@@ -157,7 +157,7 @@ def _skipped(scene: Scene, reason: str | None) -> list[str]:
 
 
 def _proposals(
-    scene: Scene, direct: DirectTransport, settings: Settings, indirect: bool, clock: Stopwatch
+    scene: Scene, direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
 ) -> Ladder | Ranking:
     """The plans to try, measured and ranked where the method leaves them open."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
@@ -171,7 +171,7 @@ def _proposals(
 
 def _tried_direct(
     evaluation: Evaluation, proposals: Ladder | Ranking, scene: Scene, settings: Settings, clock: Stopwatch
-) -> list[Parts]:
+) -> list[MethodResult]:
     """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
     if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
         return []
@@ -185,11 +185,11 @@ def _tried_direct(
 def _attempted(
     evaluation: Evaluation,
     proposals: Ladder | Ranking,
-    tried: list[Parts],
+    tried: list[MethodResult],
     scene: Scene,
     settings: Settings,
     clock: Stopwatch,
-) -> Parts:
+) -> MethodResult:
     """The first of some attempts that meets the target error, or the last; where there is no target, the first.
 
     Each attempt is judged by held-out elements of its own; those of the report decide nothing. What was evaluated
@@ -209,7 +209,7 @@ def _attempted(
     return _with_costs_of(attempts)
 
 
-def _with_costs_of(attempts: list[Parts]) -> Parts:
+def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
     """The last attempt, with what all of them evaluated; repeated elements count again."""
 
     def total(name: str) -> dict[str, int]:
@@ -273,7 +273,9 @@ def _inputs(scene: Scene, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _evaluated(parts: Parts, points: Points, lighting: CubemapLighting, skipped: list[str]) -> dict[str, Any]:
+def _evaluated(
+    parts: MethodResult, points: Points, lighting: CubemapLighting, skipped: list[str]
+) -> dict[str, Any]:
     """What was evaluated and what was not, for the report."""
     above = share_above_horizon(points, lighting)
     return {

@@ -6,8 +6,6 @@ a temporary name beside the target and renamed when complete.
 
 from __future__ import annotations
 
-import os
-import tempfile
 import zipfile
 import zlib
 from pathlib import Path
@@ -18,12 +16,9 @@ import scipy.sparse
 import zarr
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import BITS
-from mi_sparse_prt.compression.clustered_rows import Clustered
-from mi_sparse_prt.compression.haar_rows import HaarRows
+from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.glossy_storage import (
     factor_attributes,
@@ -32,15 +27,16 @@ from mi_sparse_prt.glossy_storage import (
     read_glossy,
     row_count,
 )
-from mi_sparse_prt.matrix import (
-    Factored,
-    Indirect,
-    Interpolated,
-    LightTransport,
-    MeanCosine,
-    MeshRange,
-    Visibility,
-)
+from mi_sparse_prt.io.atomic import write_atomically
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.transport import LightTransport, MeshRange
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 6
@@ -78,22 +74,13 @@ def save(transport: LightTransport | GlossyTransport, path: str | Path) -> None:
         raise PrtError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     if path.exists() and not path.is_file():
         raise PrtError(f"cannot write {path}: it is a folder or a device; give a file name such as scene.prt")
-    temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        os.close(handle)
-        _write(transport, temporary)
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-        temporary = None
+        write_atomically(path, lambda temporary: _write(transport, temporary))
     except OSError as error:
         raise PrtError(
             f"cannot write {path}: {error.strerror or error}; nothing was left behind, "
             "free some space or choose another folder"
         ) from None
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
 
 
 def load_transport(path: str | Path, scene: Any = None) -> LightTransport | GlossyTransport:
@@ -141,13 +128,7 @@ def load_transport(path: str | Path, scene: Any = None) -> LightTransport | Glos
     return transport if scene is None else transport.for_scene(scene)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _write(transport: LightTransport | GlossyTransport, path: str) -> None:
+def _write(transport: LightTransport | GlossyTransport, path: Path) -> None:
     attributes: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -200,9 +181,9 @@ def _arrays(transport: LightTransport | GlossyTransport) -> dict[str, NDArray[An
     elif isinstance(direct, HaarRows):
         arrays |= {"haar_starts": direct.starts, "haar_places": direct.places}
         arrays |= {"haar_values": direct.values, "haar_scales": direct.scales}
-    if isinstance(indirect, Indirect):
+    if isinstance(indirect, Upsampled):
         arrays |= {"indirect": indirect.density, **_sparse_arrays("upsampling", indirect.upsampling)}
-    elif isinstance(indirect, Factored):
+    elif isinstance(indirect, LowRank):
         for name, factors in (("left", indirect.left), ("right", indirect.right)):
             arrays |= {f"{name}_{c}": factor for c, factor in enumerate(factors)}
     return arrays
@@ -309,23 +290,23 @@ def _shares(
 
 def _indirect(
     arrays: dict[str, NDArray[Any]], lighting: CubemapLighting
-) -> Indirect | Interpolated | Factored:
+) -> Upsampled | Interpolated | LowRank:
     if "left_0" in arrays:
         return _factored(arrays)
     density = arrays["indirect"]
-    indirect = Indirect(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
+    indirect = Upsampled(density, _sparse_matrix("upsampling", arrays, density.shape[1]), lighting)
     if "weights_indirect_data" in arrays:
         return Interpolated(indirect, _sparse_matrix("weights_indirect", arrays, len(density)))
     return indirect
 
 
-def _factored(arrays: dict[str, NDArray[Any]]) -> Factored:
+def _factored(arrays: dict[str, NDArray[Any]]) -> LowRank:
     left, right = (
         [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
     )
     if len(left) not in (1, 3) or [a.shape[1] for a in left] != [b.shape[0] for b in right]:
         raise ValueError("factors of the indirect light do not fit together")
-    return Factored(tuple(left), tuple(right))
+    return LowRank(tuple(left), tuple(right))
 
 
 def _check_shapes(arrays: dict[str, NDArray[Any]], lighting: CubemapLighting, rows: int) -> None:

@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compression.clustered_rows import Clustered
-from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.matrix import Factored, Indirect, LightTransport, MeanCosine, MeshRange, Visibility
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport, MeshRange
 
 matplotlib.use("Agg")
 T = mi.ScalarTransform4f
@@ -149,11 +153,11 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
         coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
         channels = 1 if "full" in form else 3
         density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
-        indirect = Indirect(density, upsampling(coarse, lighting), lighting)
+        indirect = Upsampled(density, upsampling(coarse, lighting), lighting)
     if "factored" in form:
         ranks = (3,) if "grey" in form else (2, 3, 5)
         sides = [[rng.random(shape, np.float32) for shape in ((n_vertices, r), (r, m))] for r in ranks]
-        indirect = Factored(tuple(a for a, _ in sides), tuple(b for _, b in sides))
+        indirect = LowRank(tuple(a for a, _ in sides), tuple(b for _, b in sides))
     return LightTransport(
         lighting=lighting,
         basis="direction" if form.startswith("bits") else "texel",

@@ -1,11 +1,11 @@
 """Time, error and memory on the user's own machine, every speed as a ratio to the strongest other form, in one run."""
 
-from mi_sparse_prt.benchmark.choices import measure_choices
-from mi_sparse_prt.benchmark.cpca import measure_cpca
+from mi_sparse_prt.benchmark.clustered_pca import measure_cpca
 from mi_sparse_prt.benchmark.gallery import draw_gallery, save_gallery
-from mi_sparse_prt.benchmark.glossy import measure_glossy
-from mi_sparse_prt.benchmark.methods import measure_methods
-from mi_sparse_prt.benchmark.plans import measure_plans
+from mi_sparse_prt.benchmark.glossy_transport import measure_glossy
+from mi_sparse_prt.benchmark.method_comparison import measure_methods
+from mi_sparse_prt.benchmark.plan_choice import measure_plans
+from mi_sparse_prt.benchmark.row_column_choices import measure_choices
 from mi_sparse_prt.benchmark.sizes import cost_against_size
 from mi_sparse_prt.benchmark.speed import run_benchmark
 from mi_sparse_prt.benchmark.time_error import time_against_error

@@ -20,16 +20,16 @@ from mi_sparse_prt.benchmark.columns import (
     k_means_columns,
     regions,
 )
-from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.evaluation import matrix_of
-from mi_sparse_prt.matrix import LightTransport
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods.dense import Dense
+from mi_sparse_prt.methods.dense_sampling import Dense
+from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.huang2010 import huang2010_parts
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.transport import LightTransport
 
 CHOICES: dict[str, Columns] = {"clustered_columns": clustered_columns, "k_means_columns": k_means_columns}
 
@@ -62,9 +62,9 @@ def precompute_with_columns(
     clock = Stopwatch()
     with clock.phase("setup"):
         points = vertex_points(scene)
-        direct = DirectTransport(scene.normalised, lighting, points)
+        direct = DirectSolver(scene.normalised, lighting, points)
         channels = 1 if scene.grey else 3
-        paths = PathTransport(scene.normalised, lighting, points, "direction", max_depth, spp, channels, seed)
+        paths = PathSolver(scene.normalised, lighting, points, "direction", max_depth, spp, channels, seed)
 
     def columns(dense: Dense, mean: NDArray[np.float32]) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
         return _of_nearest(scene, dense, mean, CHOICES[choice], seed)

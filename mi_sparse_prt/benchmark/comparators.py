@@ -20,25 +20,21 @@ from mi_sparse_prt.benchmark.columns import (
     random_columns,
     regions,
 )
-from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
-from mi_sparse_prt.bits import Bits
+from mi_sparse_prt.benchmark.exact_rows import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.measurement.neighbours import radius_neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.huang2010 import LEAST_NEIGHBOURS, MOST_NEIGHBOURS, RADIUS, RELATIVE_LAMBDA
+from mi_sparse_prt.reconstruction.interpolation_weights import inverse_distance_weights, linear_weights
 from mi_sparse_prt.reconstruction.l1 import l1_fit
-from mi_sparse_prt.reconstruction.neighbours import (
-    inverse_distance_weights,
-    linear_weights,
-    radius_neighbours,
-    surface_neighbours,
-)
-from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import best_features
 from mi_sparse_prt.sampling.spatial import choose_dense, weighted_choice
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 ROWS = 0.25  # Figure 5
 INTERPOLATED_FROM = 12  # neighbours, as many as method="sparse" has
@@ -238,7 +234,7 @@ def plot_choices(report: dict[str, Any]) -> Figure:
 
 def _surface(scene: Scene, lighting: CubemapLighting, name: str) -> _Surface:
     inside, points = mesh_named(scene, name).vertices, vertex_points(scene)
-    direct = DirectTransport(scene.normalised, lighting, points)
+    direct = DirectSolver(scene.normalised, lighting, points)
     bits = traced_rows(direct, np.arange(inside.start, inside.stop, dtype=np.uint32))
     return _Surface(
         scene.normalised_positions[inside], scene.normals[inside], points.keys[inside], bits, lighting

@@ -7,11 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mi_sparse_prt.compression.clustered_rows import Clustered
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 Floats = NDArray[np.float32]
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.benchmark.estimates import row_errors
-from mi_sparse_prt.matrix import LightTransport, Visibility
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.transport import LightTransport
 
 BLOCK = 512  # rows at a time: tens of megabytes, and those of their dense vertices
 LIT = (

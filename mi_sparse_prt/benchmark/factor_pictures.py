@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from mi_sparse_prt.measurement.brdf_factors import BrdfFactors
+from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
 
 SIZE = 160  # pixels of a hemisphere
 

@@ -8,17 +8,17 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.figure import Figure
 
+from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
 from mi_sparse_prt.benchmark.cpca_pictures import cluster_picture, side_by_side
 from mi_sparse_prt.benchmark.factor_pictures import factor_picture
-from mi_sparse_prt.benchmark.reference import MAX_DEPTH
 from mi_sparse_prt.compression.compress import AnyTransport, compress
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.glossy import TERMS, GlossyTransport, precompute_glossy
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.relighting.image import background_emitter, render
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.validation.glossy import lit_scene
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.validation.glossy_images import lit_scene
 
 SPP, REFERENCE_SPP = 64, 256
 DIFFERENCE = 5  # times as bright

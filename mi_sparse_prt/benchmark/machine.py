@@ -13,9 +13,9 @@ from typing import Any
 import drjit as dr
 import psutil
 
-from mi_sparse_prt.cost import versions
+from mi_sparse_prt.core.profiling import versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # parameters of mallopt in glibc's malloc.h
 _DEFAULTS = {_TRIM_THRESHOLD: 128 << 10, _MMAP_MAX: 65536}

@@ -6,13 +6,13 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.direct import measure_direct
+from mi_sparse_prt.benchmark.direct_speed import measure_direct
 from mi_sparse_prt.benchmark.machine import report_header
-from mi_sparse_prt.benchmark.paths import measure_paths
-from mi_sparse_prt.benchmark.relight import measure_relighting
+from mi_sparse_prt.benchmark.path_speed import measure_paths
+from mi_sparse_prt.benchmark.relight_speed import measure_relighting
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
 
 FEWEST_REPEATS = 3
 

@@ -8,19 +8,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mi_sparse_prt.benchmark.brute_force import RowsTime
+from mi_sparse_prt.benchmark.brute_force_time import RowsTime
 from mi_sparse_prt.benchmark.column_methods import CHOICES, precompute_with_columns
-from mi_sparse_prt.benchmark.direct import measure_direct
+from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH, SPP, Reference
+from mi_sparse_prt.benchmark.direct_speed import measure_direct
 from mi_sparse_prt.benchmark.equal_error import BruteForce
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
-from mi_sparse_prt.benchmark.reference import MAX_DEPTH, SPP, Reference
 from mi_sparse_prt.benchmark.time_error_figure import save_figures
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError, PrtWarning
-from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.planner.plan import Plan
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.precompute import precompute
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 SPPS = (1, 4, 16, 64)  # of brute force
 ADJOINT_SPPS = (2, 8, 32)

@@ -35,11 +35,11 @@ from mi_sparse_prt.cli.tables import (
     time_error_tables,
     validation_table,
 )
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.validation.glossy import GlossyValidation, validate_glossy
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.variant import VARIANTS
+from mi_sparse_prt.validation.glossy_images import GlossyValidation, validate_glossy
 from mi_sparse_prt.validation.validate import Validation
-from mi_sparse_prt.variant import VARIANTS
 
 AnyTransport = prt.LightTransport | prt.GlossyTransport
 

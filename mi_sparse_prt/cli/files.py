@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
 
 
 def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float) -> bytes:

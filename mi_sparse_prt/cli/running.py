@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 
 FAILED, INTERRUPTED = 1, 130  # exit codes
 FILE_WIDTH = 150  # characters of a table's line where there is no terminal

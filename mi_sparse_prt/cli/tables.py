@@ -8,9 +8,9 @@ from typing import Any
 from rich.table import Table
 
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.validation.glossy import CAUSES
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
+from mi_sparse_prt.validation.glossy_images import CAUSES
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.compression.clustered import MeshClusters, clustered_mesh, mesh_rows
-from mi_sparse_prt.compression.clustered_rows import Clustered
-from mi_sparse_prt.compression.haar_rows import HaarRows
-from mi_sparse_prt.compression.truncation import TARGET, haar_part
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.compression.clustered_pca import MeshClusters, clustered_mesh, mesh_rows
+from mi_sparse_prt.compression.haar_truncation import TARGET, haar_part
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.transport import LightTransport
 
 PER_CLUSTER = 300  # vertices, by default ...
 MOST_CLUSTERS = 120  # ... unless clusters become more than these, of one mesh

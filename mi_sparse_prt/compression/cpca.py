@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.threads import one_blas_thread
+from mi_sparse_prt.core.threads import one_blas_thread
 
 ITERATIONS = 1  # of assigning and fitting, for each basis vector
 SETTLING = 4  # of them, at the beginning without basis vectors, and at the end with all

@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.emission.equirectangular import Potential
-from mi_sparse_prt.errors import PrtError
 
 # [face, (s_axis, t_axis, centre), xyz]
 FACE_FRAMES = np.array(

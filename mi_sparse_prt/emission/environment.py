@@ -22,8 +22,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.equirectangular import pixel_solid_angles
-from mi_sparse_prt.errors import PrtError, PrtWarning
 
 SUFFIXES = (".exr", ".hdr", ".pfm")
 

@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.hashing import hash_rows
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.core.random_keys import hash_rows
+from mi_sparse_prt.scene.scene import Scene
 
 # A Mitsuba ray reaches a vertex from just above one of its triangles: this far from the corner towards the
 # triangle's centre (barycentric), and from this height over it (in units of the scene's longest side).

@@ -10,19 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.checkpoint import Checkpoint
-from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.matrix import Indirect, MeanCosine, Visibility
+from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.methods.parts import Parts
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
 
 
-def exact_direct(solver: DirectTransport, scene: Scene, clock: Stopwatch, progress: bool) -> Parts:
+def exact_direct(solver: DirectSolver, scene: Scene, clock: Stopwatch, progress: bool) -> MethodResult:
     """All direct light, phase ``direct``: bits, or in the texel basis the mean cosines of the solver's strata."""
     with clock.phase("direct"):
         stored = solver.row_storage(len(solver.points))
@@ -35,21 +37,21 @@ def exact_direct(solver: DirectTransport, scene: Scene, clock: Stopwatch, progre
         part = MeanCosine(stored.astype(np.uint16, copy=False), solver.lighting)
     elements = len(solver.points) * solver.lighting.n_directions
     rays = int(share_above_horizon(solver.points, solver.lighting) * elements) * solver.rays_per_element
-    return Parts(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
+    return MethodResult(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
 
 
 def path_traced(
-    solver: PathTransport,
+    solver: PathSolver,
     lighting: CubemapLighting,
     clock: Stopwatch,
     progress: bool,
     checkpoint: Path | None = None,
-) -> Indirect:
+) -> Upsampled:
     """All indirect light, phase ``indirect``, at the resolution of the solver.
 
     Parameters
     ----------
-    solver : PathTransport
+    solver : PathSolver
     lighting : CubemapLighting
         To which it is interpolated.
     clock : Stopwatch
@@ -62,7 +64,7 @@ def path_traced(
         density = np.zeros(shape, dtype=np.float16)
         kept = Checkpoint(checkpoint, density) if checkpoint else None
         _trace(solver, density, lambda ids: solver.rows(ids).mean, "indirect", progress, kept)
-    return Indirect(density, upsampling(solver.lighting, lighting), lighting)
+    return Upsampled(density, upsampling(solver.lighting, lighting), lighting)
 
 
 def share_above_horizon(points: Points, lighting: CubemapLighting) -> float:
@@ -72,7 +74,7 @@ def share_above_horizon(points: Points, lighting: CubemapLighting) -> float:
 
 
 def _trace(
-    solver: DirectTransport | PathTransport,
+    solver: DirectSolver | PathSolver,
     stored: NDArray[Any],
     rows: Callable[[NDArray[np.uint32]], NDArray[Any]],
     name: str,

@@ -16,21 +16,23 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.bits import counts, pack
-from mi_sparse_prt.checkpoint import Checkpoint
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Indirect, Interpolated, Visibility
-from mi_sparse_prt.methods.dense import Dense, DenseSampler, indirect_of
-from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.core.bits import counts, pack
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.io.checkpoint import Checkpoint
+from mi_sparse_prt.measurement.neighbours import radius_neighbours
+from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler, indirect_of
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.l1 import l1_fit
-from mi_sparse_prt.reconstruction.neighbours import radius_neighbours
-from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import best_features
-from mi_sparse_prt.scene import Mesh, Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
 
 DENSE_MODEL, DENSE_GROUND = 0.25, 0.205  # Figure 9
 RADIUS = 0.05  # of the scene's longest side: 0.2 on a ground from -2 to 2 (Figure 8)
@@ -54,14 +56,14 @@ def best_of_each_vertex(
 
 def huang2010_parts(
     scene: Scene,
-    direct: DirectTransport,
-    indirect: PathTransport | None,
+    direct: DirectSolver,
+    indirect: PathSolver | None,
     seed: int,
     clock: Stopwatch,
     progress: bool,
     checkpoint: Path | None = None,
     columns: Columns = best_of_each_vertex,
-) -> Parts:
+) -> MethodResult:
     """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``.
 
     ``columns`` chooses the directions of sparse vertices, by whichever rule the paper's is to be compared with.
@@ -93,7 +95,7 @@ def huang2010_parts(
     # the paper counts the whole grid, below the horizon too
     per_dense = counts(dense.rows.evaluated | pack(quarter))
     elements = int(per_dense.sum()) + int(evaluated.sum())
-    return Parts(
+    return MethodResult(
         Interpolated(visibility, weights),
         Interpolated(interreflected, weights) if interreflected else None,
         elements,
@@ -115,7 +117,7 @@ def huang2010_parts(
 
 
 def _refuse_what_does_not_fit(
-    scene: Scene, fractions: dict[str, float], direct: DirectTransport, indirect: PathTransport | None
+    scene: Scene, fractions: dict[str, float], direct: DirectSolver, indirect: PathSolver | None
 ) -> None:
     """Before anything is traced: whole rows of all dense vertices and channels, and their means, in float32."""
     n_dense = sum(fractions[mesh.name] * (mesh.vertices.stop - mesh.vertices.start) for mesh in scene.meshes)
@@ -130,11 +132,11 @@ def _refuse_what_does_not_fit(
 
 
 def _interreflected(
-    solver: PathTransport, dense: Dense, grid: AngularGrid, progress: bool, checkpoint: Path | None
-) -> tuple[Indirect, Checkpoint | None]:
+    solver: PathSolver, dense: Dense, grid: AngularGrid, progress: bool, checkpoint: Path | None
+) -> tuple[Upsampled, Checkpoint | None]:
     """Indirect light of the dense vertices, and the file of finished rows; their variances are not kept."""
     rows, kept = indirect_of(solver, dense.ids, grid.texels, "indirect", progress, checkpoint)
-    return Indirect(rows.mean.astype(np.float16), grid.upsampling, solver.lighting), kept
+    return Upsampled(rows.mean.astype(np.float16), grid.upsampling, solver.lighting), kept
 
 
 def _flat(scene: Scene, mesh: Mesh) -> bool:
@@ -145,11 +147,11 @@ def _flat(scene: Scene, mesh: Mesh) -> bool:
 
 def _fitted(
     scene: Scene,
-    direct: DirectTransport,
-    indirect: PathTransport | None,
+    direct: DirectSolver,
+    indirect: PathSolver | None,
     dense: Dense,
     visibility: Visibility,
-    interreflected: Indirect | None,
+    interreflected: Upsampled | None,
     columns: Columns,
     clock: Stopwatch,
     progress: bool,
@@ -192,7 +194,7 @@ def _fitted(
 
 
 def whole_rows(
-    visibility: Visibility, interreflected: Indirect | None
+    visibility: Visibility, interreflected: Upsampled | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Whole rows of white transport: dense vertices, from which L1 minimization has its equations.
 
@@ -238,8 +240,8 @@ def _near(scene: Scene, ids: NDArray[np.int64], dense: Dense) -> NDArray[np.int3
 
 
 def _sampled(
-    direct: DirectTransport,
-    indirect: PathTransport | None,
+    direct: DirectSolver,
+    indirect: PathSolver | None,
     ids: NDArray[np.int64],
     directions: NDArray[np.int32],
     clock: Stopwatch,

@@ -5,7 +5,7 @@ ray is traced and its value kept. So the direct part is exact in cosine and soli
 that is stored: with 260 sampled values a vertex, weights and residual of T = A D + S would take more memory.
 
 Indirect light is smooth. Dense rows are path traced on a quarter of the directions, freed of noise by their low rank,
-and interpolated along the surface: T_indirect = A D. See ``methods.indirect``.
+and interpolated along the surface: T_indirect = A D. See ``methods.sparse_indirect``.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import counts, pack
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.matrix import Interpolated, Visibility
-from mi_sparse_prt.methods.dense import Dense, DenseSampler
-from mi_sparse_prt.methods.indirect import indirect_part
-from mi_sparse_prt.methods.neighbourhoods import neighbourhoods
-from mi_sparse_prt.methods.parts import Parts
+from mi_sparse_prt.core.bits import counts, pack
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.methods.dense_neighbourhoods import neighbourhoods
+from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.methods.sparse_indirect import indirect_part
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus
-from mi_sparse_prt.scene import Mesh, Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
 
 DENSE = 0.22  # of the vertices of a mesh
 STEP = DENSE / 4  # of them in an iteration
@@ -37,22 +38,22 @@ ROUNDS = 2  # of repair
 
 def sparse_parts(
     scene: Scene,
-    direct: DirectTransport,
-    indirect: PathTransport | None,
+    direct: DirectSolver,
+    indirect: PathSolver | None,
     seed: int,
     clock: Stopwatch,
     progress: bool,
     checkpoint: Path | None = None,
     dense_fraction: float | None = None,
-) -> Parts:
+) -> MethodResult:
     """Evaluate few elements of T and reconstruct the others.
 
     Parameters
     ----------
     scene : Scene
-    direct : DirectTransport
+    direct : DirectSolver
         Direction basis, at the scene's vertices.
-    indirect : PathTransport or None
+    indirect : PathSolver or None
         At the same vertices and the full resolution of the lighting.
     seed : int
     clock : Stopwatch
@@ -90,7 +91,7 @@ def sparse_parts(
     return _account(scene, direct, indirect, dense, grid, state, part, paths)
 
 
-def _known(direct: DirectTransport, dense: Dense, grid: AngularGrid, clock: Stopwatch) -> Consensus:
+def _known(direct: DirectSolver, dense: Dense, grid: AngularGrid, clock: Stopwatch) -> Consensus:
     """Visibility with the rows of dense vertices in it."""
 
     def trace(vertices: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
@@ -105,14 +106,14 @@ def _known(direct: DirectTransport, dense: Dense, grid: AngularGrid, clock: Stop
 
 def _account(
     scene: Scene,
-    direct: DirectTransport,
-    indirect: PathTransport | None,
+    direct: DirectSolver,
+    indirect: PathSolver | None,
     dense: Dense,
     grid: AngularGrid,
     state: Consensus,
     part: Interpolated | None,
     paths: int,
-) -> Parts:
+) -> MethodResult:
     """The parts, and how many elements of each were evaluated."""
     quarter = np.zeros(direct.lighting.n_directions, bool)
     quarter[grid.texels] = True
@@ -120,7 +121,7 @@ def _account(
     if part is not None:
         either[dense.ids] = counts(state.evaluated[dense.ids] | pack(quarter))
     rays = int(counts(state.evaluated).sum())
-    parts = Parts(
+    parts = MethodResult(
         Visibility(state.visible, scene.normals, direct.lighting),
         part,
         int(either.sum()),

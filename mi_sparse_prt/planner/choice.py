@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from mi_sparse_prt.estimation.held_out import ROUND
+from mi_sparse_prt.methods.plan import DENSE, GATHER, Plan
 from mi_sparse_prt.planner.direct_costs import DirectCost
-from mi_sparse_prt.planner.gather_costs import GatherCosts
 from mi_sparse_prt.planner.path_costs import PathCosts
-from mi_sparse_prt.planner.plan import DENSE, GATHER, Plan
+from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
-from mi_sparse_prt.validation.held_out import ROUND
 
 TARGET = 0.02  # where none is given
 MARGIN = 0.95  # of a target is aimed at by paths, whose number is free

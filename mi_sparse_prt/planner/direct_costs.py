@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mi_sparse_prt.bits import Bits, counts, listed, unpack
+from mi_sparse_prt.core.bits import Bits, counts, listed, unpack
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.planner.timing import seconds_per_row
+from mi_sparse_prt.operators.single_elements import elements
+from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.texel_edges import fractional_visibility
-from mi_sparse_prt.validation.elements import elements
-from mi_sparse_prt.validation.pilot_elements import PilotElements
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 
 PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
@@ -35,7 +35,7 @@ class DirectCost:
     error: float
 
 
-def exact_cost(direct: DirectTransport, held: PilotElements) -> DirectCost:
+def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     """All rays. In the texel basis there is an error, by the number of strata."""
     seconds = len(direct.points) * seconds_per_row(direct)
     if direct.basis == "direction":
@@ -45,11 +45,11 @@ def exact_cost(direct: DirectTransport, held: PilotElements) -> DirectCost:
     return DirectCost(seconds, math.sqrt(max(square, 0.0)))
 
 
-def edges_cost(scene: Scene, direct: DirectTransport, held: PilotElements) -> DirectCost:
+def edges_cost(scene: Scene, direct: DirectSolver, held: PilotElements) -> DirectCost:
     """Texels' centres, and rays along edges of visibility, in the texel basis."""
-    solver = DirectTransport(scene.normalised, direct.lighting, direct.points)
+    solver = DirectSolver(scene.normalised, direct.lighting, direct.points)
     centres = len(direct.points) * seconds_per_row(solver)
-    some = DirectTransport(scene.normalised, direct.lighting, points_at(direct.points, held.vertices))
+    some = DirectSolver(scene.normalised, direct.lighting, points_at(direct.points, held.vertices))
     places = np.arange(len(held.vertices))
     bits = some.rows(places).astype(np.uint32, copy=False)
     part, _ = fractional_visibility(some, bits)
@@ -66,7 +66,7 @@ def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
     return Points(*(x[ids] for x in (points.positions, points.normals, points.offset_normals, points.keys)))
 
 
-def consensus_cost(scene: Scene, direct: DirectTransport, held: PilotElements, seed: int) -> DirectCost:
+def consensus_cost(scene: Scene, direct: DirectSolver, held: PilotElements, seed: int) -> DirectCost:
     """Consensus in the direction basis, from patches inside of which all rays are traced as well."""
     patches, inner, stands_for = _patches(scene, seed)
     ids = np.concatenate(patches)
@@ -113,7 +113,7 @@ def _patches(
     return patches, np.concatenate(inner), np.concatenate(stands_for)
 
 
-def _seconds_per_ray(direct: DirectTransport, ids: NDArray[np.int64], asked: Bits) -> float:
+def _seconds_per_ray(direct: DirectSolver, ids: NDArray[np.int64], asked: Bits) -> float:
     """Of rays that consensus asks for, with others of the same vertices around them."""
     rows, texels = listed(asked)
     vertices = ids[rows].astype(np.uint32)
@@ -122,7 +122,7 @@ def _seconds_per_ray(direct: DirectTransport, ids: NDArray[np.int64], asked: Bit
     return (time.perf_counter() - start) / max(len(rows), 1)
 
 
-def _energy(direct: DirectTransport, ids: NDArray[np.int64], bits: Bits) -> NDArray[np.float64]:
+def _energy(direct: DirectSolver, ids: NDArray[np.int64], bits: Bits) -> NDArray[np.float64]:
     """Squared norms (n,) of white direct light where bits (n, words) are set."""
     lighting, total = direct.lighting, np.zeros(len(ids))
     for a in range(0, len(ids), PATCH):

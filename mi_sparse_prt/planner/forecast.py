@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import psutil
 
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.evaluation import indirect_solver
-from mi_sparse_prt.planner.plan import Plan
-from mi_sparse_prt.planner.timing import seconds_per_row
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.methods.execution import indirect_solver
+from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.row_timing import seconds_per_row
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
 class _Share(NamedTuple):
@@ -42,7 +42,7 @@ _INDIRECT = {
 
 def forecast(
     scene: Scene,
-    direct: DirectTransport,
+    direct: DirectSolver,
     settings: Settings,
     plan: Plan,
     indirect: bool,
@@ -53,7 +53,7 @@ def forecast(
     Parameters
     ----------
     scene : Scene
-    direct : DirectTransport
+    direct : DirectSolver
         At all vertices.
     settings : Settings
     plan : Plan

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.evaluation import indirect_solver
-from mi_sparse_prt.planner.timing import seconds_per_row
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.methods.execution import indirect_solver
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.row_timing import seconds_per_row
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.paths import PathSolver
 
 PILOT_PATHS = 6144  # per vertex
 PILOT_SPP = 16  # where rows are timed
@@ -105,7 +105,7 @@ def noise_of_a_path(held: PilotElements) -> float:
 
 
 def _interpolated(
-    solver: PathTransport, lighting: CubemapLighting, held: PilotElements
+    solver: PathSolver, lighting: CubemapLighting, held: PilotElements
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and variance (k, t, channels) at the held-out elements, interpolated from coarse rows."""
     estimate, weights = solver.rows(held.vertices), upsampling(solver.lighting, lighting)

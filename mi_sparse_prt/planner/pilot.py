@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mi_sparse_prt.estimation import element_sampling, held_out
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN, TARGET, Costs, choose, predictions
 from mi_sparse_prt.planner.direct_costs import consensus_cost, edges_cost, exact_cost
-from mi_sparse_prt.planner.gather_costs import gather_costs
 from mi_sparse_prt.planner.path_costs import (
     COARSEST,
     coarse_resolutions,
@@ -14,12 +16,10 @@ from mi_sparse_prt.planner.path_costs import (
     path_costs,
     seconds_of_a_path,
 )
+from mi_sparse_prt.planner.radiosity_costs import gather_costs
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.validation import chosen, held_out
-from mi_sparse_prt.validation.pilot_elements import PilotElements
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 VERTICES = 192  # of a pilot, in all meshes together
 LEAST_VERTICES = 16  # of each
@@ -29,13 +29,13 @@ LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samp
 DRAWN = 0.6e-6  # seconds per element of a check that is drawn for direct light
 
 
-def measure(scene: Scene, direct: DirectTransport, settings: Settings, indirect: bool) -> Costs:
+def measure(scene: Scene, direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     """Measure the costs of all plans that settings leave open.
 
     Parameters
     ----------
     scene : Scene
-    direct : DirectTransport
+    direct : DirectSolver
         At all vertices.
     settings : Settings
         ``method`` is ``"auto"`` or ``"brute_force"``.
@@ -87,8 +87,8 @@ def _too_dear(costs: Costs, settings: Settings, path: float, noise: float) -> bo
 def _check(held: PilotElements) -> float:
     """Seconds of a check by held-out elements."""
     totals = [int(size) * held.lighting.n_directions for size in held.sizes]
-    drawn = DRAWN * sum(chosen.rays_of(total) for total in totals)
+    drawn = DRAWN * sum(element_sampling.rays_of(total) for total in totals)
     if held.indirect is None:
         return drawn
-    paths = sum(chosen.paths_of(total, len(totals)) for total in totals)
+    paths = sum(element_sampling.paths_of(total, len(totals)) for total in totals)
     return drawn + paths * held_out.SPP * held.indirect.seconds

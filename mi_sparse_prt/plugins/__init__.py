@@ -3,8 +3,8 @@
 import mitsuba as mi
 
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
-from mi_sparse_prt.plugins.factored import InOutFactors
-from mi_sparse_prt.plugins.glossy import AshikhminShirley, Phong
+from mi_sparse_prt.plugins.glossy_bsdfs import AshikhminShirley, Phong
+from mi_sparse_prt.plugins.in_out_factors import InOutFactors
 from mi_sparse_prt.plugins.mesh_vertices import MeshVertices
 from mi_sparse_prt.plugins.sparse_prt import SparsePRT
 

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import load_environment
-from mi_sparse_prt.errors import PrtError
 
 # Distance of the light in units of 1 + |position|: far behind any ceiling, near enough for float32
 FAR = 1e6

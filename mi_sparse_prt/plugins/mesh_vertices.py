@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
 
 

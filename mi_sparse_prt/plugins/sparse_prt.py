@@ -8,11 +8,11 @@ from pathlib import Path
 import mitsuba as mi
 
 from mi_sparse_prt.cache import cached_glossy, cached_precompute
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.errors import PrtError, PrtWarning
+from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.settings import Settings
+from mi_sparse_prt.scene.scene import Scene
 
 
 class SparsePRT(mi.SamplingIntegrator):

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 
 Floats = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.errors import PrtError
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.measurement.factor_tables import looked_up, outgoing_tables
-from mi_sparse_prt.plugins.factored import VaryingDiffuse
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.reflection.factor_tables import looked_up, outgoing_tables
+from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart

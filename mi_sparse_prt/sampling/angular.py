@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import BITS, Bits, above_horizon, listed, lowest, pack, scattered
+from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, listed, lowest, pack, scattered
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
 
 RADIUS = 3  # texels: windows of 7 x 7

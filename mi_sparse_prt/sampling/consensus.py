@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import above_horizon, listed, overwrite
-from mi_sparse_prt.measurement.curve import along_curve
-from mi_sparse_prt.reconstruction.neighbours import renumbered, surface_neighbours
+from mi_sparse_prt.core.bits import above_horizon, listed, overwrite
+from mi_sparse_prt.core.morton import along_curve
+from mi_sparse_prt.measurement.neighbours import renumbered, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import contested, copy_agreed
 

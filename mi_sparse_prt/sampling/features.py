@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import Bits
+from mi_sparse_prt.core.bits import Bits
 
 
 def contested(

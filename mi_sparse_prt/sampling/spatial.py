@@ -10,10 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import ones
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.hashing import mix
-from mi_sparse_prt.reconstruction.neighbours import finite_rows, radius_neighbours
+from mi_sparse_prt.core.bits import ones
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.measurement.neighbours import finite_rows, radius_neighbours
 
 ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its rank accounts for
 RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box

@@ -13,13 +13,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mi_sparse_prt.matrix import LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.validation import figures as draw
-from mi_sparse_prt.validation.reference import ReferenceMatrix, reference_image, reference_vertices
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.validation import matrix_figures as draw
+from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix, reference_image, reference_vertices
 
 GRAZED = 1e-4  # relative difference from which an element of the direct part counts as different
 
@@ -229,7 +229,7 @@ def _moved_to_hits(
     hits = sensor_points(scene, rays)
 
     def direct(points: Points, basis: str) -> NDArray[np.float32]:
-        solver = DirectTransport(
+        solver = DirectSolver(
             scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"]
         )
         white = solver.elements(*flat).reshape(len(vertices), -1, 1)

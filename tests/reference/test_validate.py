@@ -13,9 +13,9 @@ from conftest import ARTEFACTS, COLOURS, T, build, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.matrix import LightTransport, MeshRange
-from mi_sparse_prt.validation.glossy import validate_glossy
-from mi_sparse_prt.validation.reference import ReferenceMatrix
+from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.validation.glossy_images import validate_glossy
+from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix
 from mi_sparse_prt.validation.validate import matrix_errors
 
 LIGHTING = prt.CubemapLighting(2)
@@ -272,7 +272,7 @@ GLOSSY = ("glossy_bunny", "glossy_spot", "glossy_teapot", "lamp")
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::mi_sparse_prt.errors.PrtWarning")
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
 @pytest.mark.parametrize("path", [p for p in SCENES if p.stem not in GLOSSY], ids=lambda path: path.stem)
 def test_scenes(path):
     """Each scene of scenes_xml at n = 8, texel basis, its indirect light at n = 4: rows, columns and its picture.
@@ -308,7 +308,7 @@ def test_scenes(path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::mi_sparse_prt.errors.PrtWarning")
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
 @pytest.mark.parametrize("name", GLOSSY)
 def test_glossy_scenes(name):
     """Scenes with glossy surfaces at n = 16, from three cameras: what is not the factors' fault.

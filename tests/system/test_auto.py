@@ -7,9 +7,9 @@ import pytest
 from conftest import COLOURS, build, diffuse, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.planner import proposals
+from mi_sparse_prt.planner import candidates
 from mi_sparse_prt.planner.choice import Predicted
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.solvers.paths import PathSolver
 
 LIGHTING = prt.CubemapLighting(8)
 
@@ -75,7 +75,7 @@ def test_after_a_miss_it_goes_on(scene, monkeypatch):
         gathering = [p for p in plans if (p.plan.direct, p.plan.indirect) == ("exact", "gather")]
         return min(gathering, key=lambda p: (p.plan.rays, p.plan.tolerance))
 
-    monkeypatch.setattr(proposals, "choose_first", fewest_rays)
+    monkeypatch.setattr(candidates, "choose_first", fewest_rays)
     report = prt.precompute(scene, LIGHTING, target_error=0.008, progress=False).report
     tried = [plan for plan in report["plans"] if plan["chosen"]]
     assert len(tried) > 1
@@ -110,7 +110,7 @@ def test_no_pilot_looks_for_indirect_light_that_cannot_be(monkeypatch, shapes, p
     def fail(*_: object, **__: object) -> None:
         raise AssertionError("indirect light was computed")
 
-    monkeypatch.setattr(PathTransport, "elements", fail)
+    monkeypatch.setattr(PathSolver, "elements", fail)
     report = prt.precompute(build(**shapes), LIGHTING, progress=False, **parameters).report
     assert {plan["indirect"] for plan in report["plans"]} == {"none"}
     assert any(reason in sentence for sentence in report["skipped"])

@@ -9,13 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark.direct import BareOcclusion
+from mi_sparse_prt.benchmark.direct_speed import BareOcclusion
 from mi_sparse_prt.benchmark.kernels import kernels_of
-from mi_sparse_prt.benchmark.paths import MAX_DEPTH, SPP
+from mi_sparse_prt.benchmark.path_speed import MAX_DEPTH, SPP
 from mi_sparse_prt.cli import app
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
 
 SCENE = """<scene version="3.0.0">
     <emitter type="constant"/>
@@ -106,7 +106,7 @@ def test_one_kernel_serves_all_direct_blocks(scene, lighting):
     Expected: one kernel for three blocks of different offset and size.
     Result: as expected.
     """
-    solver = DirectTransport(scene.normalised, lighting, vertex_points(scene))
+    solver = DirectSolver(scene.normalised, lighting, vertex_points(scene))
     found = kernels_of(lambda: [solver.rows(np.arange(*block, dtype=np.uint32)) for block in BLOCKS])
     assert found.launches == len(BLOCKS)
     assert found.distinct == 1
@@ -136,7 +136,7 @@ def test_one_kernel_serves_all_path_blocks(scene, lighting, channels):
     Expected: one kernel and one launch per block, for rows and for listed elements, whatever the offset and size.
     Result: as expected.
     """
-    solver = PathTransport(
+    solver = PathSolver(
         scene.normalised, lighting, vertex_points(scene), "direction", MAX_DEPTH, SPP, channels
     )
     rng = np.random.default_rng(0)
@@ -161,7 +161,7 @@ def test_the_bare_loop_traces_the_same_rays(scene, lighting):
     """
     points = vertex_points(scene)
     bare = BareOcclusion(scene.normalised, lighting, points)
-    solver = DirectTransport(scene.normalised, lighting, points)
+    solver = DirectSolver(scene.normalised, lighting, points)
     above = points.normals @ lighting.directions.T > 1e-6
     for a, b in BLOCKS:
         bits = solver.rows(np.arange(a, b, dtype=np.uint32))

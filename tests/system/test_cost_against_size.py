@@ -9,7 +9,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark import sizes
 from mi_sparse_prt.benchmark.one_size import measured_apart
 from mi_sparse_prt.benchmark.sizes import cost_against_size, edge_lengths
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 
 SCENE = """<scene version="3.0.0">
     <default name="height" value="0.6"/>

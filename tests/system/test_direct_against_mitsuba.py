@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import VertexRays, sensor_points, vertex_points, vertex_rays
-from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
 def mitsuba_columns(
@@ -39,7 +39,7 @@ def towards(directions: np.ndarray):
         yield "to_world", mi.Transform4f().look_at([0, 0, 0], -d, across)
 
 
-def elements(solver: DirectTransport, albedo: np.ndarray, seed: int = 0) -> np.ndarray:
+def elements(solver: DirectSolver, albedo: np.ndarray, seed: int = 0) -> np.ndarray:
     n, m = len(solver.points), solver.lighting.n_directions
     white = solver.elements(np.repeat(np.arange(n), m), np.tile(np.arange(m), n), seed=seed)
     return albedo[:, None] * white.reshape(n, m, 1)
@@ -71,7 +71,7 @@ def test_all_columns_of_a_small_scene(coloured_scene, artefact):
     unit = mitsuba_columns(coloured_scene, rays, light, towards(lighting.directions), spp=1)
     reference = unit * lighting.solid_angles[:, None]
 
-    hits = DirectTransport(coloured_scene.normalised, lighting, sensor_points(coloured_scene, rays))
+    hits = DirectSolver(coloured_scene.normalised, lighting, sensor_points(coloured_scene, rays))
     ours = elements(hits, coloured_scene.albedo)
     print(
         f"hit against Mitsuba: {share_that_differs(ours, reference):.5%} of elements differ by more than 1e-4"
@@ -82,7 +82,7 @@ def test_all_columns_of_a_small_scene(coloured_scene, artefact):
     assert share_that_differs(ours, 1.02 * reference) > 0.95 * lit.mean()
     assert share_that_differs(ours, np.roll(reference, 1, axis=1)) > 0.3 * lit.mean()
 
-    vertices = DirectTransport(coloured_scene.normalised, lighting, vertex_points(coloured_scene))
+    vertices = DirectSolver(coloured_scene.normalised, lighting, vertex_points(coloured_scene))
     at_vertices = elements(vertices, coloured_scene.albedo)
     moved = ((at_vertices > 0) != (ours > 0)).any(axis=2)
     relative = np.linalg.norm(at_vertices - ours) / np.linalg.norm(ours)
@@ -138,11 +138,11 @@ def test_no_vertex_is_missed(kind, artefact):
     light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
     reference = mitsuba_columns(scene, rays, light, towards(lighting.directions), spp=1)
     reference *= lighting.solid_angles[:, None]
-    ours = elements(DirectTransport(scene.normalised, lighting, sensor_points(scene, rays)), scene.albedo)
+    ours = elements(DirectSolver(scene.normalised, lighting, sensor_points(scene, rays)), scene.albedo)
     assert np.isfinite(reference).all()
     assert share_that_differs(ours, reference) <= 1e-3
 
-    at_vertices = elements(DirectTransport(scene.normalised, lighting, vertex_points(scene)), scene.albedo)
+    at_vertices = elements(DirectSolver(scene.normalised, lighting, vertex_points(scene)), scene.albedo)
     assert np.isfinite(at_vertices).all()
     top = scene.positions[:, 1] > scene.positions[:, 1].max() - 1e-3
     up = top & (scene.normals[:, 1] > 0.9)
@@ -178,7 +178,7 @@ def test_texel_basis_against_the_cubemap_emitter(grey_scene, artefact):
     theirs = [
         mitsuba_columns(grey_scene, rays, light, texels, 512, seed=100 * k).sum(axis=(0, 2)) for k in range(4)
     ]
-    solver = DirectTransport(grey_scene.normalised, lighting, sensor_points(grey_scene, rays), "texel", 6)
+    solver = DirectSolver(grey_scene.normalised, lighting, sensor_points(grey_scene, rays), "texel", 6)
     ours = [elements(solver, grey_scene.albedo, seed=k).sum(axis=(0, 2)) for k in range(16)]
 
     def mean_and_error(runs: list) -> tuple[np.ndarray, np.ndarray]:

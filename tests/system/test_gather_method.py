@@ -6,11 +6,11 @@ from conftest import COLOURS, GREY, build, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Factored
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.elements import elements
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.single_elements import elements
+from mi_sparse_prt.solvers.paths import PathSolver
 
 LIGHTING = prt.CubemapLighting(8)
 FINE = 0.1  # edges, for interpolation on them to be good
@@ -56,7 +56,7 @@ def test_errors_are_small_and_the_estimate_knows_them(scene, gathered, basis):
 
 def _paths(scene: prt.Scene, chosen: NDArray, basis: str, seed: int) -> NDArray:
     """Indirect rows of some vertices by 64 paths per element."""
-    solver = PathTransport(
+    solver = PathSolver(
         scene.normalised, LIGHTING, vertex_points(scene), basis, max_depth=5, spp=64, seed=seed
     )
     white = solver.rows(chosen).mean * LIGHTING.solid_angles[:, None]
@@ -65,7 +65,7 @@ def _paths(scene: prt.Scene, chosen: NDArray, basis: str, seed: int) -> NDArray:
 
 def test_rows_columns_and_relight_are_one_matrix(gathered):
     part = gathered.indirect
-    assert isinstance(part, Factored) and len(part.left) == 3
+    assert isinstance(part, LowRank) and len(part.left) == 3
     full = gathered.rows(np.arange(gathered.shape[0]))
     some = np.array([5, 100, 383])
     assert np.allclose(gathered.columns(some), full[:, some], rtol=1e-5, atol=1e-7)

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
-from mi_sparse_prt.measurement.brdf_factors import DirectionGrid, cached, held_out
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.plugins.factored import factored_bsdf
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.term_paths import TermPaths
+from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
+from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, factor_cache, factor_error
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.term_paths import TermPaths
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
@@ -54,8 +54,8 @@ SOFT = np.concatenate(  # one even light, and some that fall off from six sides:
 def coarse_factors(monkeypatch, tmp_path) -> None:
     """Both sides have the same factors, so that coarse ones will do."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cached, "DirectionGrid", lambda: DirectionGrid(16, 32))
-    monkeypatch.setattr(held_out, "HELD_OUT", 1 << 12)
+    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: DirectionGrid(16, 32))
+    monkeypatch.setattr(factor_error, "HELD_OUT", 1 << 12)
 
 
 @dataclass

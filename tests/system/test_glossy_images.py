@@ -10,7 +10,7 @@ from conftest import T, build, diffuse
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
-from mi_sparse_prt.validation.glossy import (
+from mi_sparse_prt.validation.glossy_images import (
     CAUSES,
     DirectionLights,
     GlossyValidation,

@@ -16,8 +16,8 @@ from scipy import stats
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_rays
-from mi_sparse_prt.transport import path as path_module
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.solvers import paths as path_module
+from mi_sparse_prt.solvers.paths import PathSolver
 
 
 @dataclass
@@ -82,7 +82,7 @@ def compare(
     shape = (len(rows), lighting.n_directions)
     vertex, texel = np.repeat(rows, shape[1]), np.tile(np.arange(shape[1]), shape[0])
     points, channels = sensor_points(scene, rays), 1 if scene.grey else 3
-    path = PathTransport(scene.normalised, lighting, points, basis, max_depth, spp, channels, seed=1)
+    path = PathSolver(scene.normalised, lighting, points, basis, max_depth, spp, channels, seed=1)
     estimate = path.elements(vertex, texel)
     direct, indirect = mitsuba_columns(scene, rays.chosen(rows), lighting, basis, max_depth, *reference)
     result = []
@@ -278,9 +278,7 @@ def test_without_a_depth_limit(artefact):
     artefact(draw(result))
     assert_unbiased(result)
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
-    solver = PathTransport(
-        scene.normalised, prt.CubemapLighting(2), sensor_points(scene), max_depth=5, spp=256
-    )
+    solver = PathSolver(scene.normalised, prt.CubemapLighting(2), sensor_points(scene), max_depth=5, spp=256)
     mean = solver.rows(rows).mean[..., 1] * solver.lighting.solid_angles * scene.albedo[rows, 1, None]
     print(f"max_depth 5 has {mean.sum() / result.ours.sum():.1%} of the light")
     assert mean.sum() < 0.8 * result.ours.sum()
@@ -329,7 +327,7 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
 
     monkeypatch.setattr(path_module, "has_mirrors", lambda _: False)
     lighting = prt.CubemapLighting(1)
-    blind = PathTransport(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
+    blind = PathSolver(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
     found = (blind.mean[..., 2] * scene.albedo[rows, 2, None] * lighting.solid_angles).sum()
     print(f"without mirror paths {found / result.theirs.sum():.1%} of the indirect light")
     assert found < 0.5 * result.theirs.sum()

@@ -10,8 +10,8 @@ from scipy import stats
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import Estimate, PathTransport
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import Estimate, PathSolver
 
 LIGHTING = prt.CubemapLighting(8)
 COARSE = prt.CubemapLighting(2)
@@ -20,7 +20,7 @@ COARSE = prt.CubemapLighting(2)
 def direct(scene: prt.Scene) -> np.ndarray:
     """All elements of the direct part, (vertices, 384)."""
     n = scene.n_vertices
-    solver = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    solver = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
     white = solver.elements(np.repeat(np.arange(n), 384), np.tile(np.arange(384), n)).reshape(n, 384)
     return scene.albedo[:, :1] * white
 
@@ -28,7 +28,7 @@ def direct(scene: prt.Scene) -> np.ndarray:
 def indirect(scene: prt.Scene, seed: int, spp: int = 256) -> Estimate:
     """All elements of the indirect part at n = 2."""
     points = vertex_points(scene)
-    return PathTransport(scene.normalised, COARSE, points, spp=spp, channels=1, seed=seed).rows(
+    return PathSolver(scene.normalised, COARSE, points, spp=spp, channels=1, seed=seed).rows(
         np.arange(len(points))
     )
 
@@ -270,8 +270,8 @@ def test_block_size(coloured_scene, basis, monkeypatch, artefact):
     Result: they are.
     """
     whole = prt.precompute(coloured_scene, COARSE, method="brute_force", basis=basis, spp=4, progress=False)
-    monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", 1 << 12)
-    monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 1 << 14)
+    monkeypatch.setattr("mi_sparse_prt.solvers.direct_rays.LANES", 1 << 12)
+    monkeypatch.setattr("mi_sparse_prt.solvers.paths.LANES", 1 << 14)
     parts = prt.precompute(coloured_scene, COARSE, method="brute_force", basis=basis, spp=4, progress=False)
     ids = np.arange(coloured_scene.n_vertices)
     a, b = whole.rows(ids), parts.rows(ids)

@@ -11,17 +11,19 @@ from conftest import COLOURS, GREY, T, build, bumpy_ball, diffuse, mesh, still_l
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import unpack
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.matrix import Factored, Indirect, Interpolated
+from mi_sparse_prt.core.bits import unpack
+from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods.consensus import by_consensus
+from mi_sparse_prt.methods.consensus_visibility import by_consensus
+from mi_sparse_prt.methods.settings import METHODS
 from mi_sparse_prt.methods.sparse import sparse_parts
-from mi_sparse_prt.settings import METHODS
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.gather import GatherTransport
-from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.reference import ReferenceMatrix
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix
 
 LIGHTING = prt.CubemapLighting(8)
 N = LIGHTING.n_directions
@@ -32,7 +34,7 @@ HORIZON = 1e-6  # cosines below are zero, as far as float32 can tell
 @pytest.fixture(autouse=True)
 def few_held_out_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate of the error is not what is tested here, and takes longer than all the rest."""
-    monkeypatch.setattr("mi_sparse_prt.validation.held_out.SPP", 4)
+    monkeypatch.setattr("mi_sparse_prt.estimation.held_out.SPP", 4)
 
 
 def precompute(scene: prt.Scene, **parameters: object) -> prt.LightTransport:
@@ -97,13 +99,13 @@ def rays(monkeypatch: pytest.MonkeyPatch) -> RayCount:
 def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[NDArray[np.int64]]:
     """How often a shadow ray was asked for in sparse methods, by vertex (of 8192 at most) and texel."""
     times = np.zeros((8192, N), np.int64)
-    visible = DirectTransport.visible
+    visible = DirectSolver.visible
 
-    def recorded(self: DirectTransport, points: NDArray, texels: NDArray) -> NDArray:
+    def recorded(self: DirectSolver, points: NDArray, texels: NDArray) -> NDArray:
         np.add.at(times, (points, texels), 1)
         return visible(self, points, texels)
 
-    monkeypatch.setattr(DirectTransport, "visible", recorded)
+    monkeypatch.setattr(DirectSolver, "visible", recorded)
     yield times
 
 
@@ -130,9 +132,7 @@ def test_the_count_itself(rays):
     assert (rays.shadow, rays.full) == (130, 107)
     rays.clear()
     # between two parallel mirrors, so to say: every path has all its bounces
-    solver = PathTransport(
-        closed_room().normalised, LIGHTING, vertex_points(closed_room()), max_depth=5, spp=4
-    )
+    solver = PathSolver(closed_room().normalised, LIGHTING, vertex_points(closed_room()), max_depth=5, spp=4)
     solver.elements(np.arange(8), np.zeros(8, int))
     assert rays.full == 8 * 4 * 3
 
@@ -180,19 +180,19 @@ def test_a_grey_scene_is_computed_and_stored_in_one_channel(monkeypatch, rays, m
     (And their rays are seen by the count.)
     """
     worked: list[int] = []
-    elements, gathering = PathTransport.elements, GatherTransport.indirect
+    elements, gathering = PathSolver.elements, RadiositySolver.indirect
 
-    def traced(self: PathTransport, *rest: object, **named: object) -> object:
+    def traced(self: PathSolver, *rest: object, **named: object) -> object:
         found = elements(self, *rest, **named)
         worked.append(found.mean.shape[-1])
         return found
 
-    def gathered(self: GatherTransport, *rest: object, **named: object) -> object:
+    def gathered(self: RadiositySolver, *rest: object, **named: object) -> object:
         worked.append(self.channels)
         return gathering(self, *rest, **named)
 
-    monkeypatch.setattr(PathTransport, "elements", traced)
-    monkeypatch.setattr(GatherTransport, "indirect", gathered)
+    monkeypatch.setattr(PathSolver, "elements", traced)
+    monkeypatch.setattr(RadiositySolver, "indirect", gathered)
     for albedos, channels in ((GREY, 1), (COLOURS, 3)):
         worked.clear()
         part = precompute(build(0.5, **still_life(albedos)), method=method).indirect
@@ -201,19 +201,19 @@ def test_a_grey_scene_is_computed_and_stored_in_one_channel(monkeypatch, rays, m
     assert rays.full > 1000
 
 
-def stored_channels(part: Indirect | Interpolated | Factored | None) -> int:
-    if isinstance(part, Factored):
+def stored_channels(part: Upsampled | Interpolated | LowRank | None) -> int:
+    if isinstance(part, LowRank):
         return len(part.left)
     if isinstance(part, Interpolated):
         part = part.dense
-    assert isinstance(part, Indirect)
+    assert isinstance(part, Upsampled)
     return part.density.shape[-1]
 
 
 def test_three_channels_of_a_grey_scene_are_equal():
     scene = build(0.5, **still_life())
     three, one = (
-        PathTransport(scene.normalised, LIGHTING, vertex_points(scene), spp=16, channels=c) for c in (3, 1)
+        PathSolver(scene.normalised, LIGHTING, vertex_points(scene), spp=16, channels=c) for c in (3, 1)
     )
     some = np.arange(0, scene.n_vertices, 7)
     in_three, in_one = three.rows(some).mean, one.rows(some).mean
@@ -233,8 +233,8 @@ def test_bounces_below_the_bound_are_not_done(albedo, most):
     it is brightest.
     """
     scene = build(0.25, **still_life(((albedo,) * 3,) * 3))
-    solver = GatherTransport(scene, LIGHTING, vertex_points(scene), 64, max_depth=12)
-    light = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    solver = RadiositySolver(scene, LIGHTING, vertex_points(scene), 64, max_depth=12)
+    light = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
     even = np.stack(
         [light.elements(np.arange(scene.n_vertices), np.full(scene.n_vertices, j)) for j in (130, 150)]
     )
@@ -250,7 +250,7 @@ def test_bounces_below_the_bound_are_not_done(albedo, most):
     assert abs(found - exact).max() < 1e-3 * exact.sum(axis=1).max()
     assert abs(found - exact).max() > 0 or count == 10
     white = build(0.25, **still_life(((1.0,) * 3,) * 3))
-    every = GatherTransport(white, LIGHTING, vertex_points(white), 64, max_depth=5)
+    every = RadiositySolver(white, LIGHTING, vertex_points(white), 64, max_depth=5)
     assert every.bounces(direct.sum(axis=1)) == 3
 
 
@@ -265,11 +265,11 @@ BOX = {
 }
 
 
-def by_sparse(scene: prt.Scene, direct: DirectTransport) -> NDArray[np.uint32]:
+def by_sparse(scene: prt.Scene, direct: DirectSolver) -> NDArray[np.uint32]:
     return sparse_parts(scene, direct, None, 0, Stopwatch(), False).direct.bits
 
 
-def consensual(scene: prt.Scene, direct: DirectTransport) -> NDArray[np.uint32]:
+def consensual(scene: prt.Scene, direct: DirectSolver) -> NDArray[np.uint32]:
     return by_consensus(scene, direct, Stopwatch()).visible
 
 
@@ -281,7 +281,7 @@ SPARSE = {
 
 def evaluated(scene: prt.Scene, method: str) -> NDArray[np.bool_]:
     """Visibility (n_v, n_directions) by a sparse method."""
-    direct = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
     return unpack(SPARSE[method][0](scene, direct), N)
 
 
@@ -372,7 +372,7 @@ def test_no_direct_ray_below_the_horizon(rays, basis):
     """
     scene = build(0.5, **still_life())
     points, strata = vertex_points(scene), 3
-    solver = DirectTransport(scene.normalised, LIGHTING, points, basis, strata)
+    solver = DirectSolver(scene.normalised, LIGHTING, points, basis, strata)
     ids = np.arange(scene.n_vertices)
     solver.rows(ids)
     in_rows = rays.shadow

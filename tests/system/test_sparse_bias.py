@@ -5,9 +5,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.estimation import held_out
 from mi_sparse_prt.methods import sparse
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.validation import held_out
+from mi_sparse_prt.scene.scene import Scene
 
 LIGHTING = prt.CubemapLighting(
     16

@@ -9,9 +9,9 @@ from conftest import T, build, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import unpack
-from mi_sparse_prt.matrix import LightTransport
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.core.bits import unpack
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 LIGHTING = prt.CubemapLighting(8)
 EDGE = 0.5
@@ -106,8 +106,8 @@ def test_block_size(monkeypatch):
     """How many lanes share a wavefront is a matter of memory: bit-identical, indirect light too."""
     whole, parts = (None, None)
     for lanes in (1 << 22, 1 << 14):
-        monkeypatch.setattr("mi_sparse_prt.transport.direct.LANES", lanes)
-        monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", lanes)
+        monkeypatch.setattr("mi_sparse_prt.solvers.direct_rays.LANES", lanes)
+        monkeypatch.setattr("mi_sparse_prt.solvers.paths.LANES", lanes)
         monkeypatch.setattr("mi_sparse_prt.sampling.consensus.BLOCK", lanes >> 12)
         whole, parts = (
             parts,

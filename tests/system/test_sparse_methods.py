@@ -12,11 +12,13 @@ from conftest import COLOURS, GREY, T, build, diffuse, made_up, mesh, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import unpack
-from mi_sparse_prt.matrix import Interpolated, LightTransport, Visibility
+from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.methods.huang2010 import whole_rows
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.transport import LightTransport
 
 LIGHTING = prt.CubemapLighting(8)
 N = LIGHTING.n_directions
@@ -68,13 +70,13 @@ class Counter:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, n_vertices: int) -> None:
         self.times = np.zeros((n_vertices, N), int)
         self.paths = 0
-        visible, indirect = DirectTransport.visible, PathTransport.elements
+        visible, indirect = DirectSolver.visible, PathSolver.elements
 
-        def counted_visible(solver: DirectTransport, points: NDArray, texels: NDArray) -> NDArray:
+        def counted_visible(solver: DirectSolver, points: NDArray, texels: NDArray) -> NDArray:
             np.add.at(self.times, (points, texels), 1)
             return visible(solver, points, texels)
 
-        def counted_indirect(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+        def counted_indirect(solver: PathSolver, points: NDArray, texels: NDArray, *seed: int):
             self.paths += len(points) * solver.spp
             return indirect(solver, points, texels, *seed)
 
@@ -90,8 +92,8 @@ class Counter:
 
         monkeypatch.setattr(pipeline, "held_out_error", uncounted)
         monkeypatch.setattr("mi_sparse_prt.planner.forecast.seconds_per_row", lambda _: 0.0)
-        monkeypatch.setattr(DirectTransport, "visible", counted_visible)
-        monkeypatch.setattr(PathTransport, "elements", counted_indirect)
+        monkeypatch.setattr(DirectSolver, "visible", counted_visible)
+        monkeypatch.setattr(PathSolver, "elements", counted_indirect)
 
 
 # ------------------------------------------------------------------------------------ against brute force
@@ -389,27 +391,27 @@ def test_whole_rows_of_huang2010_take_little_more_memory_than_they_are():
 def test_interrupted_and_gone_on_with(method, tmp_path, monkeypatch):
     """Ctrl-C in the middle of the dense rows. The next run traces the others only, and its matrix is the same."""
     expected = precompute(scene(), method, 3)
-    elements, count = PathTransport.elements, [0]
-    monkeypatch.setattr(PathTransport, "block_elements", 2000)
+    elements, count = PathSolver.elements, [0]
+    monkeypatch.setattr(PathSolver, "block_elements", 2000)
 
-    def interrupted(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+    def interrupted(solver: PathSolver, points: NDArray, texels: NDArray, *seed: int):
         count[0] += len(points)
         if count[0] > 9000:
             raise KeyboardInterrupt
         return elements(solver, points, texels, *seed)
 
-    monkeypatch.setattr(PathTransport, "elements", interrupted)
+    monkeypatch.setattr(PathSolver, "elements", interrupted)
     with pytest.raises(KeyboardInterrupt):
         precompute(scene(), method, 3, checkpoint_folder=tmp_path)
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) > 4 * 2 * 6000
 
     traced = [0]
 
-    def counted(solver: PathTransport, points: NDArray, texels: NDArray, *seed: int):
+    def counted(solver: PathSolver, points: NDArray, texels: NDArray, *seed: int):
         traced[0] += len(points)
         return elements(solver, points, texels, *seed)
 
-    monkeypatch.setattr(PathTransport, "elements", counted)
+    monkeypatch.setattr(PathSolver, "elements", counted)
     again = precompute(scene(), method, 3, checkpoint_folder=tmp_path)
     first = traced[0]
     assert np.array_equal(again.indirect.dense.density, expected.indirect.dense.density)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
 from mi_sparse_prt import cache
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
 
 SIZE = 32
 BALL = """

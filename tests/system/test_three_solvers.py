@@ -12,13 +12,13 @@ from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.matrix import MeanCosine
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_points, vertex_rays
-from mi_sparse_prt.reconstruction import nodes as nodes_module
-from mi_sparse_prt.transport.adjoint import AdjointTransport
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.gather import GatherTransport
-from mi_sparse_prt.transport.path import Estimate, PathTransport
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.reconstruction import node_placement as nodes_module
+from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import Estimate, PathSolver
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
@@ -105,8 +105,8 @@ def test_adjoint_rows_are_path_traced_elements(coloured_scene, artefact, max_dep
         basis,
         max_depth,
     )
-    ours = AdjointTransport(*shared, spp=128, seed=1).rows(ids)
-    theirs = PathTransport(*shared, spp=256, seed=2).rows(ids)
+    ours = AdjointSolver(*shared, spp=128, seed=1).rows(ids)
+    theirs = PathSolver(*shared, spp=256, seed=2).rows(ids)
     artefact(draw(ours, theirs))
     assert_agree(ours, theirs)
 
@@ -125,8 +125,8 @@ def test_glass_metal_and_mirrors(artefact, basis, n):
     scene = glossy_scene()
     ids = np.arange(scene.meshes[0].vertices.stop)
     shared = (scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, 5)
-    ours = AdjointTransport(*shared, spp=1024, seed=1).rows(ids)
-    theirs = PathTransport(*shared, spp=1024, seed=2).rows(ids)
+    ours = AdjointSolver(*shared, spp=1024, seed=1).rows(ids)
+    theirs = PathSolver(*shared, spp=1024, seed=2).rows(ids)
     artefact(draw(ours, theirs))
     assert_agree(ours, theirs, 0.05)
 
@@ -164,7 +164,7 @@ def test_row_sums_under_even_light(coloured_scene):
     Result: total z within 1.9, standard errors of 0.4%.
     """
     scene, lighting = coloured_scene, prt.CubemapLighting(4)
-    adjoint = AdjointTransport(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=4, spp=16)
+    adjoint = AdjointSolver(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=4, spp=16)
     ids = np.arange(scene.n_vertices)
     sums = [
         np.einsum("ijc,j,ic->c", adjoint.rows(ids, seed=k).mean, lighting.solid_angles, scene.albedo)
@@ -193,7 +193,7 @@ def test_inner_product(coloured_scene):
     """
     scene, lighting = coloured_scene, prt.CubemapLighting(2)
     rng = np.random.default_rng(3)
-    adjoint = AdjointTransport(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=5, spp=64)
+    adjoint = AdjointSolver(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=5, spp=64)
     ids = np.arange(scene.n_vertices)
     # T[seed, row, texel, channel]
     rows = np.array([adjoint.rows(ids, seed=k).mean.astype(np.float64) for k in range(8)])
@@ -221,7 +221,7 @@ def test_inner_product(coloured_scene):
 
 def direct_part(scene: prt.Scene, lighting: prt.CubemapLighting) -> MeanCosine:
     points = vertex_points(scene)
-    solver = DirectTransport(scene.normalised, lighting, points, "texel", strata=4)
+    solver = DirectSolver(scene.normalised, lighting, points, "texel", strata=4)
     return MeanCosine(solver.rows(np.arange(len(points))), lighting)
 
 
@@ -239,9 +239,9 @@ def test_finite_elements_among_the_others(artefact):
     scene, lighting = build(0.1, **still_life(COLOURS)), prt.CubemapLighting(2)
     ids = np.sort(np.random.default_rng(4).choice(scene.n_vertices, 200, replace=False))
     shared = (scene.normalised, lighting, vertex_points(scene), "texel", 5)
-    adjoint = AdjointTransport(*shared, spp=128, seed=1).rows(ids)
-    paths = PathTransport(*shared, spp=256, seed=2).rows(ids)
-    gather = GatherTransport(scene, lighting, vertex_points(scene), 512, max_depth=5)
+    adjoint = AdjointSolver(*shared, spp=128, seed=1).rows(ids)
+    paths = PathSolver(*shared, spp=256, seed=2).rows(ids)
+    gather = RadiositySolver(scene, lighting, vertex_points(scene), 512, max_depth=5)
     found = gather.rows(direct_part(scene, lighting), ids) / lighting.solid_angles[:, None]
     artefact(draw(adjoint, paths))
     assert_agree(adjoint, paths, bias=0.05)
@@ -268,7 +268,7 @@ def test_inner_product_of_finite_elements(coloured_scene, monkeypatch, most_node
     lighting, rng = prt.CubemapLighting(4), np.random.default_rng(3)
     points = vertex_points(coloured_scene)
     nodes = nodes_module.choose_nodes(coloured_scene, points, most_nodes)
-    gather = GatherTransport(coloured_scene, lighting, points, 64, nodes=nodes)
+    gather = RadiositySolver(coloured_scene, lighting, points, 64, nodes=nodes)
     assert (len(gather.nodes) < 200) == (most_nodes == 150)
     direct = direct_part(coloured_scene, lighting)
     rows = gather.rows(direct, np.arange(coloured_scene.n_vertices)).astype(np.float64)
@@ -301,6 +301,6 @@ def test_a_closed_box_is_dark(basis):
     box = {"type": "cube", "flip_normals": True, "to_world": place, "bsdf": diffuse(0.8, 0.8, 0.8)}
     scene = build(0.5, ball=mesh("ball", vertices, triangles, diffuse(0.5, 0.5, 0.5)), box=box)
     shared = (scene.normalised, prt.CubemapLighting(4), vertex_points(scene), basis, 6)
-    estimate = AdjointTransport(*shared, spp=4, channels=1).rows(np.arange(scene.n_vertices))
+    estimate = AdjointSolver(*shared, spp=4, channels=1).rows(np.arange(scene.n_vertices))
     assert not estimate.mean.any()
     assert not estimate.variance.any()

@@ -8,24 +8,22 @@ from scipy import stats
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.kernels import recorded_kernels
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport import adjoint as adjoint_module
-from mi_sparse_prt.transport.adjoint import AdjointTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers import adjoint_paths as adjoint_module
+from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
+from mi_sparse_prt.solvers.paths import PathSolver
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 
-def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> AdjointTransport:
-    return AdjointTransport(
-        scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters
-    )
+def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> AdjointSolver:
+    return AdjointSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
 
 
-def paths(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathTransport:
-    return PathTransport(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+def paths(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathSolver:
+    return PathSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import counts, unpack
+from mi_sparse_prt.core.bits import counts, unpack
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
 
 GRIDS = {n: AngularGrid(prt.CubemapLighting(n)) for n in (1, 2, 4, 8, 16)}

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import above_horizon, counts, listed, overwrite, pack, scattered, unpack
+from mi_sparse_prt.core.bits import above_horizon, counts, listed, overwrite, pack, scattered, unpack
 
 MASKS = st.tuples(st.integers(0, 5), st.integers(0, 100)).flatmap(lambda shape: arrays(bool, shape))
 

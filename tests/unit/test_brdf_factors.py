@@ -7,15 +7,14 @@ import pytest
 from scipy.special import eval_legendre
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.brdf_factors import (
+from mi_sparse_prt.reflection.brdf_factors import (
     DirectionGrid,
     diffuse_reflectance,
     evaluated,
     factor_brdf,
     factor_error,
-    held_out,
 )
-from mi_sparse_prt.measurement.brdf_factors import factors as making
+from mi_sparse_prt.reflection.brdf_factors import factorization as making
 
 SMALL = DirectionGrid(12, 24)
 TINY = DirectionGrid(8, 16)
@@ -222,7 +221,7 @@ def test_held_out_pairs_stand_for_all(kind):
     """
     bsdf = phong(10) if kind == "phong" else mi.load_dict(BRUSHED)
     even = even_pairs(1_000_000)
-    *drawn, weights = held_out._held_out(bsdf, 1)
+    *drawn, weights = factor_error._held_out(bsdf, 1)
     assert weights.sum() == pytest.approx(2 * np.pi**2, rel=0.005)
 
     def squares(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def test_bad_settings_are_refused_before_anything_is_written(grey_scene, counted
 
 def test_the_default_folder_is_the_users(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache.default_folder() == tmp_path / "mi_sparse_prt"
+    assert cache.cache_folder() == tmp_path / "mi_sparse_prt"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert cache.default_folder() == tmp_path / "home" / ".cache" / "mi_sparse_prt"
+    assert cache.cache_folder() == tmp_path / "home" / ".cache" / "mi_sparse_prt"

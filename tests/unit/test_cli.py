@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import mi_sparse_prt as prt
 from mi_sparse_prt.cli import app
 from mi_sparse_prt.cli.running import running
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.solvers.paths import PathSolver
 
 SCENE = """<scene version="3.0.0">
     <default name="floor" value="0.5"/>
@@ -498,7 +498,7 @@ def test_ctrl_c_while_computing(monkeypatch, folder, scene):
 
 def test_a_checkpoint_is_gone_on_with(monkeypatch, folder, scene, matrix):
     """Expected: after Ctrl-C the line says where the rows are; the same command then gives the same matrix."""
-    rows = PathTransport.rows
+    rows = PathSolver.rows
     calls = []
 
     def interrupted_later(solver, ids):
@@ -507,8 +507,8 @@ def test_a_checkpoint_is_gone_on_with(monkeypatch, folder, scene, matrix):
             raise KeyboardInterrupt
         return rows(solver, ids)
 
-    monkeypatch.setattr(PathTransport, "block_size", 4)
-    monkeypatch.setattr(PathTransport, "rows", interrupted_later)
+    monkeypatch.setattr(PathSolver, "block_size", 4)
+    monkeypatch.setattr(PathSolver, "rows", interrupted_later)
     command = [
         "precompute",
         scene,

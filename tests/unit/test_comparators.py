@@ -29,16 +29,16 @@ from mi_sparse_prt.benchmark.comparators import (
     compare_choices,
     plot_choices,
 )
-from mi_sparse_prt.benchmark.exact import mesh_named, traced_rows, white_rows
-from mi_sparse_prt.bits import pack, unpack
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.benchmark.exact_rows import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.core.bits import pack, unpack
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods.dense import DenseSampler
+from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import RELATIVE_LAMBDA
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 RESOLUTION, VERTICES = 8, 40
 CHOICES = [random_columns, clustered_columns, k_means_columns]
@@ -159,7 +159,7 @@ def _cuts(order: np.ndarray) -> list:
 
 def test_exact_rows_are_those_of_brute_force(scene: prt.Scene, lighting: prt.CubemapLighting) -> None:
     ids = np.arange(0, len(scene.positions), 7)
-    direct = DirectTransport(scene.normalised, lighting, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
     white = white_rows(traced_rows(direct, ids), scene.normals[ids], lighting)
     matrix = prt.precompute(scene, lighting, method="brute_force", max_depth=2, progress=False)
     expected = matrix.rows(ids)[..., 0] / scene.albedo[ids, :1]
@@ -172,7 +172,7 @@ def test_features_of_exact_rows_are_those_that_rays_find(
 ) -> None:
     inside = mesh_named(scene, "ball").vertices
     ids = np.arange(0, inside.stop - inside.start, 3)
-    direct = DirectTransport(scene.normalised, lighting, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
     sampler = DenseSampler(scene, direct, AngularGrid(lighting), Stopwatch())
     sampler.add(ids + inside.start)
     dense = sampler.dense()

@@ -9,13 +9,14 @@ import scipy.sparse
 from conftest import made_up
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compression import clustered
-from mi_sparse_prt.compression.clustered import finished, mesh_rows
-from mi_sparse_prt.compression.clustered_rows import Clustered
+from mi_sparse_prt.compression import clustered_pca
+from mi_sparse_prt.compression.clustered_pca import finished, mesh_rows
 from mi_sparse_prt.compression.compress import matrix_errors
 from mi_sparse_prt.compression.cpca import Clusters, settled, standard_cpca
-from mi_sparse_prt.matrix import Interpolated, LightTransport
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 FORMS = ("bits", "bits and factored light", "shares and factored light", "fixed point and full indirect")
 
@@ -120,7 +121,7 @@ def test_a_coloured_scene_shares_clusters_among_channels() -> None:
 
 def test_clusters_that_are_fitted_to_some_of_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """All rows have coefficients then, and errors are those of all."""
-    monkeypatch.setattr(clustered, "FITTED", 8)
+    monkeypatch.setattr(clustered_pca, "FITTED", 8)
     transport = made_up("bits and factored light")
     compressed = prt.compress(transport, clusters=1, bases=4, progress=False)
     found = relative(every_row(compressed), every_row(transport))

@@ -11,9 +11,9 @@ from conftest import build, diffuse
 from rich.console import Console
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import cpca, glossy
+from mi_sparse_prt.benchmark import clustered_pca, glossy_transport
 from mi_sparse_prt.cli.tables import cpca_tables, glossy_tables
-from mi_sparse_prt.scene import Scene
+from mi_sparse_prt.scene.scene import Scene
 
 
 def tiny(bsdf: dict) -> Scene:
@@ -42,9 +42,9 @@ def printed(tables: list) -> str:
 
 def test_cpca(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways see the same rows; errors of two passes are those of the compressed matrix."""
-    monkeypatch.setattr(cpca, "BASES", 6)
-    monkeypatch.setattr(cpca, "SPP", 4)
-    report = cpca.measure_cpca(tiny(diffuse(0.7, 0.7, 0.7)), prt.CubemapLighting(4), False, tmp_path)
+    monkeypatch.setattr(clustered_pca, "BASES", 6)
+    monkeypatch.setattr(clustered_pca, "SPP", 4)
+    report = clustered_pca.measure_cpca(tiny(diffuse(0.7, 0.7, 0.7)), prt.CubemapLighting(4), False, tmp_path)
     json.dumps(report)
     assert report["meshes"].keys() == {"ball", "ground"}
     for found in report["meshes"].values():
@@ -66,11 +66,11 @@ def test_cpca(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_glossy(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Brute force is slower than finite elements, and takes its direct light from the same rays."""
     for name, value in (("IMAGE_SPP", 8), ("IMAGE_WIDTH", 48), ("SPP", 4), ("ROWS", 8)):
-        monkeypatch.setattr(glossy, name, value)
+        monkeypatch.setattr(glossy_transport, name, value)
     phong = {"type": "phong", "exponent": 20.0, "diffuse_reflectance": {"type": "rgb", "value": 0.2}}
     with pytest.warns(prt.PrtWarning, match="not diffuse"):
         scene = tiny(phong)
-    report = glossy.measure_glossy(scene, prt.CubemapLighting(4), False, tmp_path)
+    report = glossy_transport.measure_glossy(scene, prt.CubemapLighting(4), False, tmp_path)
     json.dumps(report)
     seconds, ratios = report["seconds"], report["ratios"]
     assert ratios["glossy_over_diffuse"] == pytest.approx(seconds["glossy"] / seconds["diffuse"])
@@ -86,7 +86,7 @@ def test_glossy(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_diffuse_copy_has_the_same_vertices() -> None:
     with pytest.warns(prt.PrtWarning, match="not diffuse"):
         scene = tiny({"type": "roughplastic", "alpha": 0.3})
-    copy = glossy.diffuse_copy(scene)
+    copy = glossy_transport.diffuse_copy(scene)
     np.testing.assert_allclose(copy.positions, scene.positions, atol=1e-6)
     np.testing.assert_allclose(copy.normals, scene.normals, atol=1e-5)
     assert copy.diffuse

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mi_sparse_prt import CubemapLighting
-from mi_sparse_prt.bits import unpack
+from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.sampling import consensus
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import STRIDES, Consensus, Surface, by_levels

@@ -7,14 +7,14 @@ import scipy.sparse
 from conftest import build, diffuse
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.matrix import Interpolated
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.planner.plan import Plan
-from mi_sparse_prt.transport.contacts import contacts
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.gather_matrix import gather_matrix
-from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.validation.elements import elements
+from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.single_elements import elements
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.form_factors import gather_matrix
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.touching_surfaces import contacts
 
 LIGHTING = prt.CubemapLighting(4)
 WHITE = diffuse(0.8, 0.8, 0.8)
@@ -131,11 +131,11 @@ def test_errors_at_a_contact_shrink():
     scene, lighting = build(0.1, ground=GROUND, ball=BALL), LIGHTING
     points, near = vertex_points(scene), np.linalg.norm(scene.positions, axis=1)
     ids = np.setdiff1d(np.nonzero(near < 0.35)[0], contacts(scene, lighting).vertices)
-    paths = PathTransport(scene.normalised, lighting, points, "direction", 3, 4096, 1)
+    paths = PathSolver(scene.normalised, lighting, points, "direction", 3, 4096, 1)
     every = np.repeat(ids, lighting.n_directions), np.tile(np.arange(lighting.n_directions), len(ids))
     shape = len(ids), lighting.n_directions
     true = paths.elements(*every, 0).mean.reshape(shape) * lighting.solid_angles
-    direct = DirectTransport(scene.normalised, lighting, points)
+    direct = DirectSolver(scene.normalised, lighting, points)
     found = prt.precompute(scene, lighting, Plan("exact", "gather", 1024, 0.001), max_depth=3, progress=False)
     ours = elements(found.indirect, *every).reshape(shape)
     light = direct.elements(

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numba
 import pytest
 
-from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.core.profiling import Stopwatch
 
 
 class Now:
@@ -32,7 +32,9 @@ class Now:
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> Now:
     clock = Now()
-    monkeypatch.setattr("mi_sparse_prt.cost.time", SimpleNamespace(perf_counter=lambda: clock.seconds))
+    monkeypatch.setattr(
+        "mi_sparse_prt.core.profiling.time", SimpleNamespace(perf_counter=lambda: clock.seconds)
+    )
     monkeypatch.setattr(dr, "kernel_history", clock.history)
     return clock
 

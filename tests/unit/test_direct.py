@@ -7,19 +7,18 @@ import pytest
 from conftest import build, diffuse, mesh
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct import FIXED_POINT, DirectTransport
-from mi_sparse_prt.transport.lanes import TexelArrays, random_generator
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import FIXED_POINT, DirectSolver
 
 
-def solver(scene: Scene, n: int, basis: str = "direction", **parameters: int) -> DirectTransport:
-    return DirectTransport(
-        scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters
-    )
+def solver(scene: Scene, n: int, basis: str = "direction", **parameters: int) -> DirectSolver:
+    return DirectSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
 
 
-def every(direct: DirectTransport) -> tuple[np.ndarray, np.ndarray]:
+def every(direct: DirectSolver) -> tuple[np.ndarray, np.ndarray]:
     """Point and texel of all elements, row by row."""
     n, m = len(direct.points), direct.lighting.n_directions
     return np.repeat(np.arange(n), m), np.tile(np.arange(m), n)

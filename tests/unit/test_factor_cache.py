@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.brdf_factors import (
-    DirectionGrid,
-    cached,
-    factor_error,
-    factors_of,
-    held_out,
-)
+from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, factor_cache, factor_error, factors_of
 
 SMALL = DirectionGrid(10, 20)
 
@@ -24,7 +18,7 @@ class Counted:
     """``factor_brdf``, with a count of its calls."""
 
     def __init__(self) -> None:
-        self.calls, self.made = 0, cached.factor_brdf
+        self.calls, self.made = 0, factor_cache.factor_brdf
 
     def __call__(self, *args: object) -> object:
         self.calls += 1
@@ -33,10 +27,10 @@ class Counted:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
-    monkeypatch.setattr(cached, "DirectionGrid", lambda: SMALL)
-    monkeypatch.setattr(held_out, "HELD_OUT", 1 << 12)
+    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: SMALL)
+    monkeypatch.setattr(factor_error, "HELD_OUT", 1 << 12)
     counter = Counted()
-    monkeypatch.setattr(cached, "factor_brdf", counter)
+    monkeypatch.setattr(factor_cache, "factor_brdf", counter)
     return counter
 
 
@@ -74,7 +68,7 @@ def test_what_makes_another_file(counted, tmp_path, monkeypatch):
     any_factors = counted.made(phong(), "vase", 16, SMALL)
     any_error = factor_error(any_factors, phong(), "vase")
     counted.made = lambda *_: any_factors  # what they are does not matter here
-    monkeypatch.setattr(cached, "factor_error", lambda *_: any_error)
+    monkeypatch.setattr(factor_cache, "factor_error", lambda *_: any_error)
     brushed = {"type": "ashikhmin_shirley", "exponent_u": 10.0, "exponent_v": 10.0}
     bsdfs = [
         phong(),
@@ -89,9 +83,9 @@ def test_what_makes_another_file(counted, tmp_path, monkeypatch):
     for bsdf in bsdfs:
         factors_of(bsdf, "vase", folder=tmp_path)
     assert counted.calls == len(bsdfs)
-    monkeypatch.setattr(cached, "DirectionGrid", lambda: DirectionGrid(8, 20))
+    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: DirectionGrid(8, 20))
     factors_of(phong(), "vase", folder=tmp_path)
-    monkeypatch.setattr(cached, "FORMAT", cached.FORMAT + 1)
+    monkeypatch.setattr(factor_cache, "FORMAT", factor_cache.FORMAT + 1)
     factors_of(phong(), "vase", folder=tmp_path)
     assert counted.calls == len(bsdfs) + 2 == len(list(tmp_path.iterdir()))
 

@@ -12,14 +12,9 @@ import pytest
 from test_glossy_bsdfs import at, directions, hemisphere, rgb
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.brdf_factors import (
-    BrdfFactors,
-    DirectionGrid,
-    diffuse_reflectance,
-    factor_brdf,
-)
-from mi_sparse_prt.measurement.factor_tables import incident_tables, outgoing_tables, table_directions
-from mi_sparse_prt.plugins.factored import factored_bsdf
+from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
+from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid, diffuse_reflectance, factor_brdf
+from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tables, table_directions
 
 BRUSHED = {
     "type": "ashikhmin_shirley",

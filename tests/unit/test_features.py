@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mi_sparse_prt.bits import Bits, pack, unpack
+from mi_sparse_prt.core.bits import Bits, pack, unpack
 from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
 
 M = 40  # directions: a word and part of a second

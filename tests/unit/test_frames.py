@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.frames import triangle_tangents, vertex_tangents
+from mi_sparse_prt.reflection.frames import triangle_tangents, vertex_tangents
 
 BRUSHED = {"type": "ashikhmin_shirley", "exponent_u": 5.0, "exponent_v": 60.0}
 LIGHTING = prt.CubemapLighting(2)

@@ -10,35 +10,37 @@ import scipy.sparse
 from conftest import COLOURS, T, build, diffuse, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.matrix import Interpolated, MeanCosine, Visibility
+from mi_sparse_prt.core import sparse_product as product_module
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.sparse_product import gathered, product
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport import direct_columns as columns_module
-from mi_sparse_prt.transport import first_bounce as bounce_module
-from mi_sparse_prt.transport import gather as gather_module
-from mi_sparse_prt.transport import gather_matrix as matrix_module
-from mi_sparse_prt.transport import sparse_product as product_module
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.gather import GatherTransport
-from mi_sparse_prt.transport.gather_matrix import gather_matrix
-from mi_sparse_prt.transport.sparse_product import gathered, product
+from mi_sparse_prt.operators import direct_columns as columns_module
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers import first_bounce as bounce_module
+from mi_sparse_prt.solvers import form_factors as matrix_module
+from mi_sparse_prt.solvers import radiosity as gather_module
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.form_factors import gather_matrix
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
 
 WHITE = diffuse(1, 1, 1)
 ROOM = {"type": "cube", "flip_normals": True}
 
 
-def solver(scene: Scene, n: int = 2, rays: int = 64, **parameters: int) -> GatherTransport:
-    return GatherTransport(scene, prt.CubemapLighting(n), vertex_points(scene), rays, **parameters)
+def solver(scene: Scene, n: int = 2, rays: int = 64, **parameters: int) -> RadiositySolver:
+    return RadiositySolver(scene, prt.CubemapLighting(n), vertex_points(scene), rays, **parameters)
 
 
 def visibility(scene: Scene, n: int = 4) -> Visibility:
     lighting, points = prt.CubemapLighting(n), vertex_points(scene)
-    bits = DirectTransport(scene.normalised, lighting, points).rows(np.arange(len(points)))
+    bits = DirectSolver(scene.normalised, lighting, points).rows(np.arange(len(points)))
     return Visibility(bits, scene.normals, lighting)
 
 
-def neumann(gather: GatherTransport, direct: np.ndarray, albedo: np.ndarray, bounces: int) -> np.ndarray:
+def neumann(gather: RadiositySolver, direct: np.ndarray, albedo: np.ndarray, bounces: int) -> np.ndarray:
     """Dense float64 sums of G rho D + (G rho)^2 D + ..., (n_v, n, 3)."""
     operator, found = gather.matrix.toarray().astype(np.float64), []
     for rho in albedo.T.astype(np.float64):
@@ -248,7 +250,7 @@ def test_light_that_never_ends():
 def direct_parts(scene: Scene) -> dict:
     bits = visibility(scene)
     lighting, points = bits.lighting, vertex_points(scene)
-    texel = DirectTransport(scene.normalised, lighting, points, "texel")
+    texel = DirectSolver(scene.normalised, lighting, points, "texel")
     n, rng = scene.n_vertices, np.random.default_rng(0)
     weights = scipy.sparse.random_array((n, 60), density=0.1, rng=rng, dtype=np.float32).tocsr()
     dense = bits.reordered(np.sort(rng.choice(n, 60, replace=False)))

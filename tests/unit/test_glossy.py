@@ -7,10 +7,10 @@ from conftest import build, diffuse
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.measurement.frames import frames, orthogonal
+from mi_sparse_prt.operators.direct_columns import DirectColumns
+from mi_sparse_prt.reflection.frames import frames, orthogonal
 from mi_sparse_prt.relighting.image import render
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.direct_columns import DirectColumns
+from mi_sparse_prt.scene.scene import Scene
 
 BRUSHED = {
     "type": "ashikhmin_shirley",

@@ -10,7 +10,7 @@ from conftest import build, diffuse
 import mi_sparse_prt as prt
 from mi_sparse_prt.cache import cached_glossy
 from mi_sparse_prt.relighting.image import render
-from mi_sparse_prt.transport.direct import DirectTransport
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 LIGHTING = prt.CubemapLighting(2)
 LIGHT = np.random.default_rng(0).random((LIGHTING.n_directions, 3)).astype(np.float32)
@@ -137,7 +137,7 @@ def test_a_bsdf_chosen_later(scene, general, monkeypatch):
         the old BSDF's.
     """
     with monkeypatch.context() as context:
-        context.setattr(DirectTransport, "__init__", None)
+        context.setattr(DirectSolver, "__init__", None)
         swapped = general.with_bsdf("ball", mi.load_dict(PLASTIC))
     direct = prt.precompute_glossy(scene_of(PLASTIC), LIGHTING, harmonics=3, max_depth=2, progress=False)
     np.testing.assert_allclose(radiance(swapped), radiance(direct), rtol=1e-5, atol=1e-6)

@@ -9,10 +9,11 @@ from tqdm.auto import tqdm
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.compression.compress import compress
-from mi_sparse_prt.compression.haar_rows import HaarRows
-from mi_sparse_prt.compression.truncation import haar_mesh, haar_part, truncate
+from mi_sparse_prt.compression.haar_truncation import haar_mesh, haar_part, truncate
 from mi_sparse_prt.emission.haar import haar, haar_squares, inverse_haar
-from mi_sparse_prt.matrix import LightTransport, MeanCosine, MeshRange
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.transport import LightTransport, MeshRange
 
 ROUNDED = 1e-3  # of float16 numbers, relative
 

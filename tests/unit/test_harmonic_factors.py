@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.brdf_factors import DirectionGrid, evaluated, factor_error, harmonic_factors
+from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, evaluated, factor_error, harmonic_factors
 
 GRID = DirectionGrid(12, 24)
 BRUSHED = {"type": "ashikhmin_shirley", "exponent_u": 5.0, "exponent_v": 60.0}

@@ -11,12 +11,15 @@ from conftest import mesh as mesh_of
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.matrix import Indirect, Interpolated, LightTransport, MeanCosine
-from mi_sparse_prt.transport.direct import BITS
-from mi_sparse_prt.validation import chosen, held_out
-from mi_sparse_prt.validation.chosen import for_direct_light, for_indirect_light
-from mi_sparse_prt.validation.elements import elements
-from mi_sparse_prt.validation.held_out import Sample, held_out_error, relative
+from mi_sparse_prt.estimation import element_sampling, held_out
+from mi_sparse_prt.estimation.element_sampling import for_direct_light, for_indirect_light
+from mi_sparse_prt.estimation.held_out import Sample, held_out_error, relative
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.single_elements import elements
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.solvers.direct_rays import BITS
+from mi_sparse_prt.transport import LightTransport
 
 LIGHTING = prt.CubemapLighting(4)
 SEEDS = range(6)
@@ -166,9 +169,9 @@ def test_a_seed_is_a_choice(exact):
 @pytest.fixture
 def few(monkeypatch):
     """About 1500 rays and 150 elements by paths for a mesh."""
-    monkeypatch.setattr(chosen, "FEWEST_RAYS", 1500)
-    monkeypatch.setattr(chosen, "PATHS", 150)
-    monkeypatch.setattr(chosen, "FEW_PATHS", 150)
+    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 1500)
+    monkeypatch.setattr(element_sampling, "PATHS", 150)
+    monkeypatch.setattr(element_sampling, "FEW_PATHS", 150)
     monkeypatch.setattr(held_out, "SPP", 128)
 
 
@@ -182,7 +185,7 @@ def test_rare_wrong_bits(exact, monkeypatch, where):
     is small enough to see a bias of 2% of the error; at least 85% of the intervals of +-2 reported standard errors
     hold the truth, and the reported ones are as large as the spread of the estimates (40 say that within a third).
     """
-    monkeypatch.setattr(chosen, "FEWEST_RAYS", 16_000)
+    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 16_000)
     scene, transport = exact
     truth = [transport.rows(np.arange(scene.n_vertices)).astype(np.float64)] * 2
     if where == "anywhere":
@@ -208,7 +211,7 @@ def test_a_target_far_off_takes_a_quarter(exact, monkeypatch):
         would show 2% of the error), twice as far from the truth on average, and reported so. Where the error is the
         target, nearly all of them, and as good an estimate as without a target.
     """
-    monkeypatch.setattr(chosen, "FEWEST_RAYS", 16_000)
+    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 16_000)
     scene, transport = exact
     truth = [transport.rows(np.arange(scene.n_vertices)).astype(np.float64)] * 2
     wrong = flipped(transport, 4000, seed=1)
@@ -372,10 +375,10 @@ def test_weighted_sums_are_those_of_all_elements(exact):
         assert all(((c.vertices >= inside.start) & (c.vertices < inside.stop)).all() for c in drawn)
 
 
-def made_of_light(scene: prt.Scene, lighting: prt.CubemapLighting) -> Indirect:
+def made_of_light(scene: prt.Scene, lighting: prt.CubemapLighting) -> Upsampled:
     """Indirect light of random size at each element."""
     density = np.random.default_rng(5).exponential(size=(scene.n_vertices, lighting.n_directions, 1))
-    return Indirect(density.astype(np.float16), upsampling(lighting, lighting), lighting)
+    return Upsampled(density.astype(np.float16), upsampling(lighting, lighting), lighting)
 
 
 def test_every_vertex_is_looked_at_and_all_edges(exact):
@@ -389,9 +392,9 @@ def test_every_vertex_is_looked_at_and_all_edges(exact):
     assert set(found.vertices) == set(range(scene.n_vertices))
     bits = np.unpackbits(transport.direct.bits.view(np.uint8), axis=1, bitorder="little")
     factors = {}
-    base = chosen.FAR_FROM_EDGES
+    base = element_sampling.FAR_FROM_EDGES
     for i, j, weight in list(zip(found.vertices, found.texels, found.weights, strict=True))[::300]:
-        around = np.argsort(-(directions @ directions[j]), kind="stable")[: chosen.AROUND + 1]
+        around = np.argsort(-(directions @ directions[j]), kind="stable")[: element_sampling.AROUND + 1]
         around = around[scene.normals[i] @ directions[around].T > 0]
         edge = len(set(bits[i, around])) > 1
         chance = transport.lighting.solid_angles[j] * (scene.normals[i] @ directions[j])

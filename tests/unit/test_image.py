@@ -136,7 +136,7 @@ def test_relighting_images_is_linear(scene, transport):
     np.testing.assert_allclose(both, a + 2 * b, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.filterwarnings("error::mi_sparse_prt.errors.PrtWarning")
+@pytest.mark.filterwarnings("error::mi_sparse_prt.core.errors.PrtWarning")
 def test_kinds_of_lighting(scene, transport):
     """Texels, an Environment and an emitter that say the same give the same picture."""
     n = LIGHTING.resolution

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
 from mi_sparse_prt import storage
-from mi_sparse_prt.matrix import Indirect, Interpolated, LightTransport
+from mi_sparse_prt.operators.interpolated import Interpolated
+from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.transport import LightTransport
 
 N_V, N_DENSE, N = 50, 12, 4
 FORMS = (
@@ -256,4 +258,4 @@ def test_a_plain_indirect_part_is_not_mistaken(tmp_path):
     """Files of the other methods have no weights, and no interpolation comes back."""
     plain = made_up("bits and coarse indirect")
     plain.save(tmp_path / "a.prt")
-    assert isinstance(prt.load_transport(tmp_path / "a.prt").indirect, Indirect)
+    assert isinstance(prt.load_transport(tmp_path / "a.prt").indirect, Upsampled)

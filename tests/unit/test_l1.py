@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.linear_model import Lasso
 
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reconstruction.l1 import Fit, l1_fit, least_squares_fit
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mi_sparse_prt.reconstruction.neighbours import linear_weights, surface_neighbours
+from mi_sparse_prt.measurement.neighbours import surface_neighbours
+from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 
 
 def _plane(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,9 @@ import pytest
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reconstruction import low_rank
-from mi_sparse_prt.reconstruction.low_rank import denoised as factored
-from mi_sparse_prt.reconstruction.low_rank import smoothed
+from mi_sparse_prt.reconstruction import denoising
+from mi_sparse_prt.reconstruction.denoising import denoised as factored
+from mi_sparse_prt.reconstruction.denoising import smoothed
 
 R = 4
 LONG = 600  # the longer side of matrices whose error is predicted
@@ -278,7 +278,7 @@ def test_many_values_above_the_noise_are_found_exactly(monkeypatch):
     """The sketch gives up when it is full."""
     rows, variance = noisy(truth(600, 300, 3), 1.0)
     sketched = factored(rows, variance)
-    monkeypatch.setattr(low_rank, "SKETCH", R)
+    monkeypatch.setattr(denoising, "SKETCH", R)
     exact = factored(rows, variance)
     assert sketched.rank >= R
     assert exact.rank >= sketched.rank

@@ -9,12 +9,13 @@ from conftest import FORMS, build, diffuse, made_up, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.compression.clustered_rows import Clustered
-from mi_sparse_prt.compression.haar_rows import HaarRows
 from mi_sparse_prt.emission.haar import inverse_haar
-from mi_sparse_prt.fractional_visibility import FractionalVisibility, _means
-from mi_sparse_prt.matrix import Factored, LightTransport, MeshRange
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility, _means
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.transport import LightTransport, MeshRange
 
 N_V, N = 50, 4
 
@@ -40,7 +41,7 @@ def slow(transport: LightTransport) -> NDArray[np.float64]:
                 white = wavelets(transport.direct, i)[:, j] * np.sqrt(solid_angle)
             else:
                 white = np.full(3, transport.direct.fixed[i, j] / 65535 * solid_angle / np.pi)
-            if isinstance(transport.indirect, Factored):
+            if isinstance(transport.indirect, LowRank):
                 pairs = zip(transport.indirect.left, transport.indirect.right, strict=True)
                 white += [a[i].astype(float) @ b[:, j].astype(float) for a, b in pairs]
             elif transport.indirect is not None:

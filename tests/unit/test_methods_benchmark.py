@@ -10,18 +10,18 @@ from conftest import COLOURS, build, diffuse, still_life
 from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import brute_force as brute_force_times
-from mi_sparse_prt.benchmark import figures, lighting, methods, reference
-from mi_sparse_prt.benchmark.brute_force import time_rows
+from mi_sparse_prt.benchmark import brute_force_time as brute_force_times
+from mi_sparse_prt.benchmark import converged_reference, method_comparison, method_figures, relit_errors
+from mi_sparse_prt.benchmark.brute_force_time import time_rows
+from mi_sparse_prt.benchmark.converged_reference import Reference
 from mi_sparse_prt.benchmark.direct_error import direct_error
 from mi_sparse_prt.benchmark.estimates import joint_relative_l2, mean_square, relative_l2, row_errors
-from mi_sparse_prt.benchmark.lighting import RelitReference, environments_of, path_traced
 from mi_sparse_prt.benchmark.machine import kept_memory
-from mi_sparse_prt.benchmark.reference import Reference
+from mi_sparse_prt.benchmark.relit_errors import RelitReference, environments_of, path_traced
 from mi_sparse_prt.cli import app
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.solvers.paths import PathSolver
 
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective">
@@ -45,9 +45,9 @@ SCENE = """<scene version="3.0.0">
 def quick(monkeypatch):
     """Small references: noisy, but all of their parts take part."""
     for module, values in (
-        (reference, {"VERTICES": 120, "TEXELS": 12, "ELEMENT_SPP": 64, "ROWS": 24, "ROW_SPP": 16}),
-        (lighting, {"VERTICES": 20, "PATHS": 1024, "ROTATIONS": 4}),
-        (figures, {"PATHS": 64, "PIXEL_SAMPLES": 1, "WIDTH": 60}),
+        (converged_reference, {"VERTICES": 120, "TEXELS": 12, "ELEMENT_SPP": 64, "ROWS": 24, "ROW_SPP": 16}),
+        (relit_errors, {"VERTICES": 20, "PATHS": 1024, "ROTATIONS": 4}),
+        (method_figures, {"PATHS": 64, "PIXEL_SAMPLES": 1, "WIDTH": 60}),
     ):
         for name, value in values.items():
             monkeypatch.setattr(module, name, value)
@@ -165,7 +165,7 @@ def test_path_traced_light_is_that_of_the_elements(coloured, grey_scene, small_l
     lights[1, 17] = [30, 20, 10]
     vertices = np.arange(0, len(scene.positions), 40)
     runs = np.stack([path_traced(scene, small_lighting, lights, vertices, 2048, seed) for seed in range(6)])
-    solver = PathTransport(
+    solver = PathSolver(
         scene.normalised,
         small_lighting,
         vertex_points(scene),
@@ -220,7 +220,7 @@ def test_direct_errors_under_a_light_are_exact(quick, monkeypatch, grey_scene, s
         **vars(exact) | {"direct": type(exact.direct)(bits, exact.direct.normals, small_lighting)}
     )
     monkeypatch.setattr(
-        lighting, "path_traced", lambda s, g, lights, ids, *_: np.zeros((len(lights), len(ids), 3))
+        relit_errors, "path_traced", lambda s, g, lights, ids, *_: np.zeros((len(lights), len(ids), 3))
     )
     relit = RelitReference(scene, exact.direct, progress=False)
     light = small_lighting.project(relit.environments["sky"])
@@ -313,11 +313,11 @@ def test_brute_force_is_timed_on_successive_rows(monkeypatch):
     """Expected: whole wavefronts of successive vertices, one in each part of the scene; or all, once, if few."""
     scene = build(edge_length=0.06, **still_life())
     solver, n = (
-        PathTransport(scene.normalised, prt.CubemapLighting(4), vertex_points(scene)),
+        PathSolver(scene.normalised, prt.CubemapLighting(4), vertex_points(scene)),
         scene.n_vertices,
     )
     traced = []
-    monkeypatch.setattr(PathTransport, "rows", lambda _, ids: traced.append(np.asarray(ids)))
+    monkeypatch.setattr(PathSolver, "rows", lambda _, ids: traced.append(np.asarray(ids)))
     found = time_rows(solver, 32)
     assert all((np.diff(ids) == 1).all() and len(ids) == 32 for ids in traced)
     starts = np.array([ids[0] for ids in traced[1:]])
@@ -334,14 +334,14 @@ def test_brute_force_is_timed_on_successive_rows(monkeypatch):
 def test_time_of_all_rows_from_some(monkeypatch):
     """Expected: with a clock that every row moves on by its own amount, the sum over all rows within four errors."""
     scene = build(edge_length=0.06, **still_life())
-    solver = PathTransport(scene.normalised, prt.CubemapLighting(4), vertex_points(scene))
+    solver = PathSolver(scene.normalised, prt.CubemapLighting(4), vertex_points(scene))
     clock = [0.0]
     each = 1 + 0.3 * np.random.default_rng(0).random(scene.n_vertices)
 
     def rows(_, ids):
         clock[0] += each[ids].sum()
 
-    monkeypatch.setattr(PathTransport, "rows", rows)
+    monkeypatch.setattr(PathSolver, "rows", rows)
     monkeypatch.setattr(brute_force_times.time, "perf_counter", lambda: clock[0])
     found = time_rows(solver, 8)
     assert found.rows < scene.n_vertices / 4
@@ -360,7 +360,7 @@ def test_breakdown_adds_up():
         "unheard_of": 0.25,
         "total": 7.0,
     }
-    stages = methods.breakdown(seconds)
+    stages = method_comparison.breakdown(seconds)
     assert sum(stages.values()) == pytest.approx(7)
     assert stages["dense rays"] == 4 and stages["rank"] == 0.5 and stages["system"] == pytest.approx(0.5)
 
@@ -368,7 +368,7 @@ def test_breakdown_adds_up():
 def test_a_method_that_cannot_be_compared():
     scene = build(plate={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)})
     with pytest.raises(PrtError, match="brute_force"):
-        methods.measure_methods(scene, prt.CubemapLighting(2), ["brute_force"], progress=False)
+        method_comparison.measure_methods(scene, prt.CubemapLighting(2), ["brute_force"], progress=False)
 
 
 def test_from_end_to_end(quick, tmp_path):
@@ -399,7 +399,7 @@ def test_from_end_to_end(quick, tmp_path):
         assert own + seconds["held_out"] == pytest.approx(seconds["total"])
         assert found["seconds_per_element"] == pytest.approx(found["ratio"] / found["elements"])
         assert sum(found["stages"].values()) == pytest.approx(seconds["total"])
-        rays = sum(found["stages"][name] for name in methods.RAYS)
+        rays = sum(found["stages"][name] for name in method_comparison.RAYS)
         assert found["overhead"]["share"] == pytest.approx(1 - rays / seconds["total"])
         assert found["errors"]["floor"]["standard_error"]["total"] > 0
     assert report["methods"]["gather"]["overhead"]["microseconds_per_sparse_vertex"] is None

@@ -6,13 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.reconstruction.neighbours import (
-    Neighbours,
-    inverse_distance_weights,
-    radius_neighbours,
-    surface_neighbours,
-)
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.measurement.neighbours import Neighbours, radius_neighbours, surface_neighbours
+from mi_sparse_prt.reconstruction.interpolation_weights import inverse_distance_weights
 
 
 def lattice(least: int, most: int) -> st.SearchStrategy:

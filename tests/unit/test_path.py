@@ -8,15 +8,15 @@ from scipy import stats
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport import path as path_module
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers import paths as path_module
+from mi_sparse_prt.solvers.paths import PathSolver
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 
-def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathTransport:
-    return PathTransport(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathSolver:
+    return PathSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
 
 
 @pytest.mark.parametrize("basis", ["direction", "texel"])

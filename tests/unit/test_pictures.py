@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark.pictures import vertex_picture
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.benchmark.vertex_pictures import vertex_picture
+from mi_sparse_prt.core.errors import PrtError
 
 
 @pytest.fixture(scope="module")

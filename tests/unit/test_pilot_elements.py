@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.validation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
 
 LIGHTING = prt.CubemapLighting(4)
 

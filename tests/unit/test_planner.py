@@ -11,9 +11,13 @@ import pytest
 from conftest import GREY, build, diffuse, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.cost import Stopwatch
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods.consensus import by_consensus
+from mi_sparse_prt.methods.consensus_visibility import by_consensus
+from mi_sparse_prt.methods.plan import GATHER, Plan
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.candidates import Ranking
 from mi_sparse_prt.planner.choice import (
     MARGIN,
     Costs,
@@ -25,16 +29,12 @@ from mi_sparse_prt.planner.choice import (
     uncertain,
 )
 from mi_sparse_prt.planner.direct_costs import PATCH, DirectCost, consensus_cost
-from mi_sparse_prt.planner.gather_costs import GatherCosts
 from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.pilot import measure
-from mi_sparse_prt.planner.plan import GATHER, Plan
-from mi_sparse_prt.planner.proposals import Ranking
+from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
-from mi_sparse_prt.settings import Settings
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.first_bounce import MOST
-from mi_sparse_prt.validation.pilot_elements import PilotElements
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.first_bounce import MOST
 
 LIGHTING = prt.CubemapLighting(4)
 EXACT = {"exact": DirectCost(10.0, 0.0)}
@@ -163,7 +163,7 @@ def test_after_a_miss_as_if_all_predictions_were_as_far_off():
 
 def test_gathering_learns_its_bias(grey_scene):
     """The error that was found is then the one that is predicted, and noise falls from there."""
-    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
+    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
     costs = measure(grey_scene, direct, Settings(4, max_depth=4), indirect=True).gather
     assert costs is not None
     for error in (0.5 * costs.error(64, 0.06), 2 * costs.error(64, 0.06)):
@@ -340,7 +340,7 @@ def test_a_plan_is_carried_out(grey_scene):
         "parameters": {"resolution": 2, "spp": 3},
     }
 
-    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
+    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
     state = by_consensus(grey_scene, direct, Stopwatch())
     mixed = prt.precompute(grey_scene, LIGHTING, Plan("consensus", "gather", 64, 0.06), progress=False)
     assert np.array_equal(mixed.direct.bits, state.visible)
@@ -356,7 +356,7 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
     """The error of small meshes, of which all is tried, against that of the whole matrix."""
     assert all(mesh.vertices.stop - mesh.vertices.start <= PATCH for mesh in grey_scene.meshes)
     lighting = prt.CubemapLighting(8)
-    direct = DirectTransport(grey_scene.normalised, lighting, vertex_points(grey_scene))
+    direct = DirectSolver(grey_scene.normalised, lighting, vertex_points(grey_scene))
     held = PilotElements(grey_scene, lighting, "direction", 2, False, 0)
     predicted = consensus_cost(grey_scene, direct, held, 0).error
     held = PilotElements(grey_scene, lighting, "direction", 5, True, 0)
@@ -382,7 +382,7 @@ def test_predicted_errors_are_those_of_the_matrix():
     Expected: the pilot's 192 vertices and the check's elements know it within some percent each.
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
-    direct = DirectTransport(scene.normalised, lighting, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
     costs = measure(scene, direct, Settings(8, target_error=0.04), indirect=True)
     assert costs.paths is not None and costs.gather is not None
     plans = [
@@ -398,7 +398,7 @@ def test_predicted_errors_are_those_of_the_matrix():
 
 @pytest.mark.parametrize("indirect", [True, False])
 def test_costs_of_what_is_left_open(grey_scene, indirect):
-    direct = DirectTransport(grey_scene.normalised, LIGHTING, vertex_points(grey_scene), "texel")
+    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene), "texel")
     costs = measure(grey_scene, direct, Settings(4, basis="texel", indirect_resolution=2), indirect)
     assert costs.direct.keys() == {"exact", "edges"}  # consensus and "sparse" are of the other basis
     assert 0 < costs.direct["edges"].error < costs.direct["exact"].error
@@ -415,7 +415,7 @@ def test_a_room_without_light():
     room = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*GREY[0])}
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": diffuse(*GREY[0])}
     scene = build(0.5, room=room, box=box)
-    direct = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
     costs = measure(scene, direct, Settings(4, max_depth=4), indirect=True)
     assert costs.gather is not None
     assert costs.gather.rank(0.03) == costs.gather.error(64, 0.06) == 0
@@ -428,7 +428,7 @@ def test_other_materials_are_not_gathered_from():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", prt.PrtWarning)
         scene = build(0.5, **shapes)
-    direct = DirectTransport(scene.normalised, LIGHTING, vertex_points(scene))
+    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
     costs = measure(scene, direct, Settings(4, max_depth=3, spp=2), indirect=True)
     assert costs.gather is None
     assert costs.paths is not None and costs.sparse is not None

@@ -7,9 +7,9 @@ from conftest import GREY, build, still_life
 from rich.console import Console
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark.plans import SLOWER, _judged, measure_plans
+from mi_sparse_prt.benchmark.plan_choice import SLOWER, _judged, measure_plans
 from mi_sparse_prt.cli.tables import plans_tables
-from mi_sparse_prt.planner.plan import Plan
+from mi_sparse_prt.methods.plan import Plan
 
 
 def carried_out(plan: Plan, seconds: float, error: float) -> dict:

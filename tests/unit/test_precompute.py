@@ -7,9 +7,11 @@ import pytest
 from conftest import GREY, build, diffuse, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.matrix import LightTransport, MeanCosine, Visibility
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.transport import LightTransport
 
 LIGHTING = prt.CubemapLighting(4)
 
@@ -24,11 +26,11 @@ def precompute(scene: prt.Scene, **parameters: object) -> LightTransport:
 def no_indirect_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """From here on the test fails if any indirect element is computed."""
 
-    def fail(self: PathTransport, *_: object, **__: object) -> None:
+    def fail(self: PathSolver, *_: object, **__: object) -> None:
         raise AssertionError("indirect light was computed")
 
-    monkeypatch.setattr(PathTransport, "rows", fail)
-    monkeypatch.setattr(PathTransport, "elements", fail)
+    monkeypatch.setattr(PathSolver, "rows", fail)
+    monkeypatch.setattr(PathSolver, "elements", fail)
 
 
 # ------------------------------------------------------------------------------------ report
@@ -92,7 +94,7 @@ def test_the_forecast_of_few_elements(grey_scene, monkeypatch, capsys, method, e
     """
     monkeypatch.setattr(
         "mi_sparse_prt.planner.forecast.seconds_per_row",
-        lambda solver: 10.0 if isinstance(solver, PathTransport) else 0.01,
+        lambda solver: 10.0 if isinstance(solver, PathSolver) else 0.01,
     )
     transport = precompute(grey_scene, method=method, progress=True)
     forecast = transport.report["forecast"]
@@ -177,23 +179,23 @@ def test_a_seed_decides_all(coloured_scene, basis):
 
 def test_an_interrupted_run_goes_on_to_the_same_matrix(grey_scene, monkeypatch, tmp_path):
     whole = precompute(grey_scene)
-    monkeypatch.setattr("mi_sparse_prt.transport.path.LANES", 1 << 14)  # blocks of 42 vertices
-    rows, calls = PathTransport.rows, []
+    monkeypatch.setattr("mi_sparse_prt.solvers.paths.LANES", 1 << 14)  # blocks of 42 vertices
+    rows, calls = PathSolver.rows, []
 
-    def interrupted(self: PathTransport, ids: np.ndarray) -> object:
+    def interrupted(self: PathSolver, ids: np.ndarray) -> object:
         calls.append(ids)
         if len(calls) == 6:  # two are the forecast's
             raise KeyboardInterrupt
         return rows(self, ids)
 
     with monkeypatch.context() as patch:
-        patch.setattr(PathTransport, "rows", interrupted)
+        patch.setattr(PathSolver, "rows", interrupted)
         with pytest.raises(KeyboardInterrupt):
             precompute(grey_scene, checkpoint_folder=tmp_path)
     (kept,) = tmp_path.iterdir()
     assert kept.stat().st_size == 3 * 42 * 96 * 2  # three blocks of half floats
 
-    monkeypatch.setattr(PathTransport, "rows", lambda self, ids: (calls.append(ids), rows(self, ids))[1])
+    monkeypatch.setattr(PathSolver, "rows", lambda self, ids: (calls.append(ids), rows(self, ids))[1])
     calls.clear()
     resumed = precompute(grey_scene, checkpoint_folder=tmp_path)
     assert calls[2][0] == 3 * 42
@@ -251,7 +253,7 @@ def test_huang2010_refuses_rows_that_do_not_fit_before_it_samples_them(grey_scen
         raise AssertionError("rays were traced")
 
     monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
-    monkeypatch.setattr(DirectTransport, "visible", fail)
+    monkeypatch.setattr(DirectSolver, "visible", fail)
     with pytest.raises(prt.PrtError, match="huang2010.*GB"):
         precompute(grey_scene, method="huang2010", max_depth=2)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark.radius import (
+from mi_sparse_prt.benchmark.neighbour_radius import (
     CURVES,
     _all_directions,
     _at_radius,
@@ -16,9 +16,9 @@ from mi_sparse_prt.benchmark.radius import (
     error_against_radius,
     plot_error_against_radius,
 )
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reconstruction.l1 import l1_fit
-from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.features import best_features
 
 RESOLUTION, DIRECTIONS, VERTICES = 8, 60, 20
@@ -119,7 +119,7 @@ def test_blocks_hold_every_vertex_once_and_bounded_systems() -> None:
 def test_blocks_do_not_change_the_result(scene: prt.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = _sampled(scene, prt.CubemapLighting(RESOLUTION), _mesh(scene), VERTICES, 0)
     _, together, _ = _at_radius(samples, 0.2, DIRECTIONS, 1e-2)
-    monkeypatch.setattr("mi_sparse_prt.benchmark.radius.MOST_TOGETHER", 1)
+    monkeypatch.setattr("mi_sparse_prt.benchmark.neighbour_radius.MOST_TOGETHER", 1)
     _, alone, _ = _at_radius(samples, 0.2, DIRECTIONS, 1e-2)
     np.testing.assert_allclose(together, alone, rtol=1e-3)
 

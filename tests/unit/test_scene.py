@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt  # noqa: F401  chooses the variant
-from mi_sparse_prt.errors import PrtError, PrtWarning
-from mi_sparse_prt.scene import Scene, load_scene
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.scene.scene import Scene, load_scene
 
 T = mi.ScalarTransform4f
 INF = float("inf")
@@ -586,7 +586,7 @@ def test_normals_of_the_file_are_kept(tmp_path: Path) -> None:
 
 
 def test_indices_out_of_range_are_refused(tmp_path: Path) -> None:
-    from mi_sparse_prt import tessellation
+    from mi_sparse_prt.scene import tessellation
 
     # Loading such a file may already crash Mitsuba's BVH: the check itself is tested, not the loader.
     positions = np.array(SQUARE, np.float32)

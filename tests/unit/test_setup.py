@@ -94,7 +94,7 @@ def test_setup_and_pyproject_want_the_same_python():
 
 
 def test_setup_and_package_want_the_same_llvm():
-    from mi_sparse_prt.variant import OLDEST_LLVM
+    from mi_sparse_prt.core.variant import OLDEST_LLVM
 
     assert f"llvm_version()[0] < {OLDEST_LLVM})" in (ROOT / ".ci/setup").read_text()
 

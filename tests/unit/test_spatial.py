@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import chisquare
 
-from mi_sparse_prt.errors import PrtError
-from mi_sparse_prt.hashing import hash_rows, mix
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.sampling.spatial import (
     ENERGY,
     ROUNDING,

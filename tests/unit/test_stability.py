@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import pack, unpack
+from mi_sparse_prt.core.bits import pack, unpack
+from mi_sparse_prt.measurement.neighbours import Neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.reconstruction.denoising import denoised
+from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 from mi_sparse_prt.reconstruction.l1 import l1_fit, least_squares_fit
-from mi_sparse_prt.reconstruction.low_rank import denoised
-from mi_sparse_prt.reconstruction.neighbours import Neighbours, linear_weights, surface_neighbours
-from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
 from mi_sparse_prt.sampling.spatial import local_rank
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.path import PathTransport
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.paths import PathSolver
 
 KINDS = ("plain", "twins", "near twins", "dark", "constant", "scales", "tiny", "huge")
 METHODS = ("sparse", "huang2010")
@@ -351,7 +352,7 @@ def test_what_a_bsdf_gives_has_to_be_finite(value, place, method):
     named = np.array(found[3].split(","), float)
     np.testing.assert_allclose(named, lighting.directions[texel], atol=1e-4)
 
-    path = PathTransport(scene.normalised, lighting, vertex_points(scene), max_depth=4, spp=4, channels=3)
+    path = PathSolver(scene.normalised, lighting, vertex_points(scene), max_depth=4, spp=4, channels=3)
     if method == "brute_force":  # with the same random numbers
         with pytest.raises(prt.PrtError, match=f"vertex {vertex} "):
             path.elements(np.array([vertex]), np.array([texel]))
@@ -365,7 +366,7 @@ def test_the_plugin_is_not_what_fails():
     """With 0.5 in the strip too it is the built-in BSDF of that reflectance."""
     ids = np.arange(0, 313, 5)
     ours, theirs = (
-        PathTransport(s.normalised, prt.CubemapLighting(2), vertex_points(s), channels=1).rows(ids).mean
+        PathSolver(s.normalised, prt.CubemapLighting(2), vertex_points(s), channels=1).rows(ids).mean
         for s in (broken(0.5, "eval"), with_ground(diffuse(0.5, 0.5, 0.5)))
     )
     np.testing.assert_allclose(ours.sum(), theirs.sum(), rtol=0.05)

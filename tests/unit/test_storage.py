@@ -14,7 +14,7 @@ from conftest import FORMS, made_up
 
 import mi_sparse_prt as prt
 from mi_sparse_prt import storage
-from mi_sparse_prt.matrix import LightTransport
+from mi_sparse_prt.transport import LightTransport
 
 COMPRESSED = {"wavelets", "clusters"}
 

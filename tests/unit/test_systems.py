@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mi_sparse_prt.reconstruction.systems import normal_equations
+from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 
 
 @given(st.integers(0, 4), st.integers(1, 5), st.integers(1, 6), st.integers(0, 9), st.integers(0, 10**6))

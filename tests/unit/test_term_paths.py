@@ -8,13 +8,13 @@ import pytest
 from conftest import T, build, diffuse
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.glossy_parts import FactoredVisibility
-from mi_sparse_prt.measurement.factor_tables import table_directions
-from mi_sparse_prt.measurement.frames import frames, orthogonal
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.transport.path import PathTransport
-from mi_sparse_prt.transport.term_paths import TermPaths
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.reflection.factor_tables import table_directions
+from mi_sparse_prt.reflection.frames import frames, orthogonal
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.term_paths import TermPaths
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
@@ -66,7 +66,7 @@ def test_white_light_is_that_of_path_transport(grey_scene, max_depth):
     rng = np.random.default_rng(1)
     ids = rng.integers(0, grey_scene.n_vertices, 500), rng.integers(0, lighting.n_directions, 500)
     found = TermPaths(grey_scene.normalised, part, points, max_depth, 8, seed=5).elements(*ids)
-    known = PathTransport(
+    known = PathSolver(
         grey_scene.normalised, lighting, points, "direction", max_depth, 8, 1, seed=5
     ).elements(*ids)
     assert found.mean.shape == found.variance.shape == (500, 3)
@@ -113,7 +113,7 @@ def test_negative_bsdfs_change_the_sign_of_each_bounce():
     points = vertex_points(positive)  # for both: random numbers are those of points
 
     def found(scene: Scene, max_depth: int) -> np.ndarray:
-        paths = PathTransport(scene.normalised, lighting, points, "direction", max_depth, 512, 1)
+        paths = PathSolver(scene.normalised, lighting, points, "direction", max_depth, 512, 1)
         return paths.rows(every).mean[..., 0].astype(np.float64)
 
     totals = np.array([np.zeros((8, 24)), *(found(positive, 2 + count) for count in bounces)])

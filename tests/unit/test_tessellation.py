@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mi_sparse_prt  # noqa: F401  chooses the variant
-from mi_sparse_prt import tessellation as ts
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene import tessellation as ts
 
 T = mi.ScalarTransform4f
 LIMIT = 100_000
@@ -80,7 +80,7 @@ PLACED = T().translate([1, -2, 3]).rotate([0, 0.6, 0.8], 40)
 )
 def test_grid_lies_on_mitsubas_own_surface(shape: str, scale: list[float], flip: bool) -> None:
     # Positions, normals and (u, v) agree with what a ray to the same point finds, mirrored or flipped.
-    from mi_sparse_prt.scene import Scene
+    from mi_sparse_prt.scene.scene import Scene
 
     checker = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}  # textured: (u, v) are kept
     placed = {"type": shape, "to_world": PLACED.scale(scale), "flip_normals": flip, "bsdf": checker}

@@ -11,16 +11,17 @@ import pytest
 from conftest import build, bumpy_ball, diffuse, mesh
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.bits import above_horizon, pack, unpack
+from mi_sparse_prt.core.bits import above_horizon, pack, unpack
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES
-from mi_sparse_prt.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.matrix import MeanCosine, Visibility
+from mi_sparse_prt.emission.texel_adjacency import TexelSides
+from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.transport import texel_edges
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.transport.texel_edges import STEPS, _cut_off, _quadrant, fractional_visibility
-from mi_sparse_prt.transport.texel_sides import TexelSides
-from mi_sparse_prt.validation.held_out import held_out_error
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.solvers import texel_edges
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.texel_edges import STEPS, _cut_off, _quadrant, fractional_visibility
 
 # ------------------------------------------------------------------------------------ which texels meet
 
@@ -155,7 +156,7 @@ def test_all_ways_to_cut_a_square():
 
 
 class Sky:
-    """Stands for ``DirectTransport`` at one point with a sky that is open where ``open_at(direction)`` says so."""
+    """Stands for ``DirectSolver`` at one point with a sky that is open where ``open_at(direction)`` says so."""
 
     def __init__(self, n: int, open_at, normal: tuple = (0, 1, 0)) -> None:
         self.lighting, self._open_at, self._normal = prt.CubemapLighting(n), open_at, normal
@@ -279,13 +280,13 @@ class CountingScene:
         return self.scene.ray_test(ray, active=active)
 
 
-def bits_of(direct: DirectTransport) -> np.ndarray:
+def bits_of(direct: DirectSolver) -> np.ndarray:
     return direct.rows(np.arange(len(direct.points)))
 
 
-def traced(scene: prt.Scene, n: int, every: int = 1) -> DirectTransport:
+def traced(scene: prt.Scene, n: int, every: int = 1) -> DirectSolver:
     points = vertex_points(scene)
-    return DirectTransport(
+    return DirectSolver(
         scene.normalised, prt.CubemapLighting(n), chosen(points, np.arange(0, len(points), every))
     )
 
@@ -296,8 +297,8 @@ def chosen(points: Points, ids: np.ndarray) -> Points:
     return Points(points.positions[ids], normals, offsets, points.keys[ids])
 
 
-def supersampled(direct: DirectTransport, strata: int) -> MeanCosine:
-    fine = DirectTransport(
+def supersampled(direct: DirectSolver, strata: int) -> MeanCosine:
+    fine = DirectSolver(
         direct.scene, direct.lighting, direct.points, "texel", strata=strata, seed=direct.seed
     )
     ids = np.arange(len(direct.points))
@@ -340,7 +341,7 @@ def test_the_order_of_vertices_and_blocks_does_not_matter(grey_scene, monkeypatc
     again, rays_again = fractional_visibility(direct, bits)
     assert same(whole, again) and rays == rays_again > 0
     order = np.random.default_rng(0).permutation(len(bits))
-    other = DirectTransport(direct.scene, direct.lighting, chosen(direct.points, order))
+    other = DirectSolver(direct.scene, direct.lighting, chosen(direct.points, order))
     assert same(fractional_visibility(other, bits_of(other))[0], whole.reordered(order))
 
 

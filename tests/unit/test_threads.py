@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from mi_sparse_prt.blocks import MADE, rows_times
-from mi_sparse_prt.threads import overlapped
+from mi_sparse_prt.core.block_products import MADE, rows_times
+from mi_sparse_prt.core.threads import overlapped
 
 
 def test_results_come_in_the_order_of_their_tasks() -> None:

@@ -7,18 +7,18 @@ import pytest
 from conftest import COLOURS, build, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import reference, time_error
+from mi_sparse_prt.benchmark import converged_reference, time_error
 from mi_sparse_prt.benchmark.column_methods import CHOICES, _of_nearest, precompute_with_columns
 from mi_sparse_prt.benchmark.columns import random_columns
 from mi_sparse_prt.benchmark.time_error import time_against_error
-from mi_sparse_prt.cost import Stopwatch
-from mi_sparse_prt.errors import PrtError
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.estimation import held_out
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods import huang2010
-from mi_sparse_prt.methods.dense import DenseSampler
+from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.transport.direct import DirectTransport
-from mi_sparse_prt.validation import held_out
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def scene() -> prt.Scene:
 def quick(monkeypatch):
     """Small references and few efforts: noisy, but all parts take part."""
     for module, values in (
-        (reference, {"VERTICES": 180, "TEXELS": 12, "ROWS": 36, "ROW_SPP": 32}),
+        (converged_reference, {"VERTICES": 180, "TEXELS": 12, "ROWS": 36, "ROW_SPP": 32}),
         (time_error, {"SPPS": (1, 4), "ADJOINT_SPPS": (2, 8), "TARGETS": (0.2, 0.05), "SPP": 4}),
         (held_out, {"SPP": 32}),
     ):
@@ -56,7 +56,7 @@ def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting, monkeypa
     monkeypatch.setattr("mi_sparse_prt.benchmark.columns.REGION", 60)
     points = vertex_points(scene)
     sampler = DenseSampler(
-        scene, DirectTransport(scene.normalised, lighting, points), AngularGrid(lighting), Stopwatch()
+        scene, DirectSolver(scene.normalised, lighting, points), AngularGrid(lighting), Stopwatch()
     )
     for mesh in scene.meshes:
         sampler.choose(mesh, 0.25, 0.05, 0)
@@ -114,7 +114,7 @@ def test_a_matrix_by_regional_columns(choice, scene, lighting):
 def test_the_papers_columns_are_the_default(grey_scene, small_lighting):
     """Expected: the same weights whether its choice is named or not, and others with another choice."""
     points = vertex_points(grey_scene)
-    direct = DirectTransport(grey_scene.normalised, small_lighting, points)
+    direct = DirectSolver(grey_scene.normalised, small_lighting, points)
 
     def weights(**columns):
         parts = huang2010.huang2010_parts(grey_scene, direct, None, 0, Stopwatch(), False, **columns)

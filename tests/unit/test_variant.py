@@ -11,7 +11,7 @@ import pytest
 
 from mi_sparse_prt import PrtError
 
-variant = importlib.import_module("mi_sparse_prt.variant")  # the package's own `variant` is the function
+variant = importlib.import_module("mi_sparse_prt.core.variant")  # the package's own `variant` is the function
 
 
 @pytest.fixture
@@ -134,6 +134,6 @@ def test_an_llvm_that_aborts_is_refused_before_it_can():
     )
     assert done.returncode == 1
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("mi_sparse_prt.errors.PrtError: libLLVM 1")
+    assert last.startswith("mi_sparse_prt.core.errors.PrtError: libLLVM 1")
     assert str(old[0]) in last
     assert "export DRJIT_LIBLLVM_PATH" in last or "apt-get install libllvm19" in last

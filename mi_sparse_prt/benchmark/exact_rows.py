@@ -1,0 +1,40 @@
+"""Exact direct light of one mesh: what choices of rows, columns and neighbours are compared on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+
+ROWS = 256  # expanded at a time
+
+
+def mesh_named(scene: Scene, name: str) -> Mesh:
+    """The mesh of this name, or an error that lists all names."""
+    found = next((mesh for mesh in scene.meshes if mesh.name == name), None)
+    if found is None:
+        names = ", ".join(mesh.name for mesh in scene.meshes)
+        raise PrtError(f"the scene has no mesh {name!r}: choose one of {names}")
+    return found
+
+
+def traced_rows(direct: DirectSolver, ids: NDArray[np.integer]) -> Bits:
+    """Visibility (n, words) of whole rows, every element traced."""
+    blocks = [direct.rows(ids[a : a + direct.block_size]) for a in range(0, len(ids), direct.block_size)]
+    return np.concatenate([direct.row_storage(0), *blocks]).astype(np.uint32, copy=False)
+
+
+def white_rows(bits: Bits, normals: NDArray[np.float32], lighting: CubemapLighting) -> NDArray[np.float32]:
+    """White direct transport (n, n_directions) of visibility bits, cosine and solid angle included."""
+    rows = np.empty((len(bits), lighting.n_directions), np.float32)
+    visibility = Visibility(bits, normals, lighting)
+    for a in range(0, len(rows), ROWS):
+        ids = np.arange(a, min(a + ROWS, len(rows)))
+        rows[ids] = visibility.rows(ids)[..., 0]
+    return rows

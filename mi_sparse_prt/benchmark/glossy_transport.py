@@ -1,0 +1,153 @@
+"""Glossy transport: its time against that of a diffuse matrix and of brute force, its images against Mitsuba's."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mi_sparse_prt.benchmark.factor_pictures import factor_picture
+from mi_sparse_prt.benchmark.machine import kept_memory, report_header
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.environment import Environment, load_environment
+from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.precompute import precompute
+from mi_sparse_prt.reflection.brdf_factors import factor_error
+from mi_sparse_prt.scene.materials import kind
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.term_paths import TermPaths
+from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
+
+SPP = 16  # of brute force
+ROWS = 64  # vertices that brute force is timed at
+IMAGE_SPP, IMAGE_WIDTH = 512, 320
+STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
+REPEATS = 2  # of which the second counts: all is compiled then
+EVALUATION = (
+    "setup",
+    "direct",
+    "gather_rays",
+    "interreflection",
+)  # of a diffuse matrix; held-out elements are not
+
+Report = dict[str, Any]
+
+
+@kept_memory()
+def measure_glossy(
+    scene: Scene, lighting: CubemapLighting, progress: bool = True, figures: Path | None = None
+) -> Report:
+    """Measure the transport of a scene with glossy surfaces.
+
+    Parameters
+    ----------
+    scene : Scene
+        With an environment and a sensor.
+    lighting : CubemapLighting
+    progress : bool
+    figures : path, optional
+        Folder for images side by side ([HR10] Figures 17 to 19) and factors of each BRDF, made if needed.
+
+    Returns
+    -------
+    dict
+        JSON as it is. ``seconds``: of ``glossy`` (factors from the cache), of ``diffuse``, a scene with the same
+        surfaces made diffuse, by the same direct light and as many gather rays, and of ``brute_force``, extrapolated
+        from some vertices, whose paths are shared by all terms; ``ratios`` of these. ``factors``: held-out errors of
+        each BRDF. ``images``: what ``validate_glossy`` reports, under the scene's environment and another.
+    """
+    plan = Plan("exact", "gather", rays=RAYS, tolerance=TOLERANCE)
+    dull = diffuse_copy(scene)
+    for _ in range(REPEATS):
+        diffuse = precompute(dull, lighting, method=plan, progress=progress).report["seconds"]
+        start = time.perf_counter()
+        transport = precompute_glossy(scene, lighting, progress=progress)
+        elapsed = time.perf_counter() - start
+    brute = _brute_force(scene, transport) + transport.report["seconds"]["direct"]
+    seconds = {
+        "glossy": elapsed,
+        "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
+        "brute_force": brute,
+    }
+    images = validate_glossy(
+        scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH, progress=progress
+    )
+    if figures is not None:
+        images.save(figures)
+        for number, factors in enumerate(transport.factors):
+            factor_picture(factors).savefig(figures / f"factors_{number}.png", dpi=110, bbox_inches="tight")
+    return {
+        **report_header(scene, lighting),
+        "parameters": transport.report["parameters"],
+        "seconds": seconds,
+        "phases": {"glossy": transport.report["seconds"], "diffuse": diffuse},
+        "ratios": {
+            "glossy_over_diffuse": seconds["glossy"] / seconds["diffuse"],
+            "brute_force_over_glossy": seconds["brute_force"] / seconds["glossy"],
+        },
+        "ranks": transport.report["ranks"],
+        "factors": _factor_errors(scene, transport),
+        "images": images.report,
+    }
+
+
+def _environments(scene: Scene) -> dict[str, Environment | mi.Emitter]:
+    """The scene's own, and small lights, where the file is: it does not come with an installed package."""
+    found: dict[str, Environment | mi.Emitter] = {"own": scene.mitsuba.environment()}
+    if STUDIO.is_file():
+        found["studio"] = load_environment(STUDIO)
+    return found
+
+
+def diffuse_copy(scene: Scene) -> Scene:
+    """The same vertices, with diffuse surfaces of the same albedo where they are glossy."""
+    shapes = {}
+    for mesh, shape, material in zip(scene.meshes, scene.unlit_shapes(), scene.materials, strict=True):
+        if not material.diffuse:
+            albedo = scene.albedo[mesh.vertices].mean(axis=0).astype(float).tolist()
+            bsdf = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}})
+            shape = with_bsdf(shape, bsdf)
+        shapes[mesh.name] = shape
+    return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=False), float("inf"))
+
+
+def _brute_force(scene: Scene, transport: GlossyTransport) -> float:
+    """Seconds of paths for all elements, white light and all terms at once."""
+    points = vertex_points(scene)
+    max_depth = transport.report["parameters"]["max_depth"]
+    assert isinstance(transport.direct, FactoredVisibility)
+    paths = TermPaths(scene.normalised, transport.direct, points, max_depth, SPP)
+    every = transport.lighting.n_directions
+    chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]
+    for some in np.split(chosen, [ROWS]):  # the second half counts
+        start = time.perf_counter()
+        paths.elements(np.repeat(some, every), np.tile(np.arange(every), len(some)))
+        elapsed = time.perf_counter() - start
+    return elapsed / ROWS * len(points)
+
+
+def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
+    found = []
+    for number, factors in enumerate(transport.factors):
+        vertex = int(np.flatnonzero(transport.material == number)[0])
+        mesh, material = next(
+            (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
+        )
+        error = factor_error(factors, material.bsdf, mesh.name)
+        found.append(
+            {
+                "mesh": mesh.name,
+                "bsdf": kind(material.bsdf),
+                "terms": factors.terms,
+                "whole": error.whole.tolist(),
+                "grazing": error.grazing.tolist(),
+                "peak": error.peak.tolist(),
+            }
+        )
+    return found

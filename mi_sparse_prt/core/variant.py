@@ -1,0 +1,129 @@
+"""Chooses the Mitsuba variant in which the package runs, once, before any other module is imported.
+
+Plugins and array types exist per variant, so the choice must be made first; and an unfit libLLVM ends the
+whole process the first time a kernel is compiled, so it is looked at before anything runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from mi_sparse_prt.core.errors import PrtError
+
+VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
+OLDEST_LLVM = 17  # 14 to 16 cannot select fmaximum on AVX-512 and abort
+
+
+def variant() -> str | None:
+    """Name of the Mitsuba variant in use."""
+    import mitsuba as mi
+
+    return mi.variant()
+
+
+def choose_variant(name: str | None = None) -> str:
+    """Make sure that Mitsuba runs in a variant which the package supports.
+
+    The first of these decides: `name`; the environment variable ``MI_SPARSE_PRT_VARIANT``; the variant that
+    is already set; ``cuda_ad_rgb`` where there is a GPU; ``llvm_ad_rgb``.
+
+    Parameters
+    ----------
+    name
+        ``"cuda_ad_rgb"``, ``"llvm_ad_rgb"`` or None.
+
+    Returns
+    -------
+    str
+        The variant, now set.
+
+    Raises
+    ------
+    PrtError
+        The variant is not one of these two, or has no GPU, or no libLLVM that works.
+    """
+    _point_drjit_to_llvm()
+    import drjit as dr
+    import mitsuba as mi
+
+    name = name or os.environ.get("MI_SPARSE_PRT_VARIANT") or mi.variant()
+    name = name or ("cuda_ad_rgb" if _cuda_works() else "llvm_ad_rgb")
+    if name not in VARIANTS:
+        raise PrtError(
+            f"Mitsuba variant {name!r} is not supported: call mitsuba.set_variant('llvm_ad_rgb') or "
+            "('cuda_ad_rgb') before importing mi_sparse_prt, or set MI_SPARSE_PRT_VARIANT to one of them"
+        )
+    if name == "llvm_ad_rgb":
+        _check_llvm(dr.detail.llvm_version() if dr.has_backend(dr.JitBackend.LLVM) else None)
+    elif not dr.has_backend(dr.JitBackend.CUDA):
+        raise PrtError("variant cuda_ad_rgb: no CUDA driver or GPU found: use llvm_ad_rgb")
+    if mi.variant() != name:
+        mi.set_variant(name)
+    return name
+
+
+def newest_llvm(folders: Iterable[Path] | None = None) -> Path | None:
+    """Newest libLLVM of at least version 17 in `folders` (default: where systems keep them), or None."""
+    found: list[tuple[list[int], Path]] = []
+    for folder in _library_folders() if folders is None else folders:
+        for path in folder.glob("libLLVM*.so*"):
+            # libLLVM.so.19.1, libLLVM-17.so.1; a plain libLLVM.so is a link to one of them
+            match = re.match(r"libLLVM(?:-|\.so\.)(\d+(?:\.\d+)*)", path.resolve().name)
+            if match and path.exists():
+                found.append(([int(part) for part in match[1].split(".")], path.resolve()))
+    version, newest = max(found, default=([0], None))
+    return newest if version[0] >= OLDEST_LLVM else None
+
+
+def _library_folders() -> list[Path]:
+    named = [Path(entry) for entry in os.environ.get("LD_LIBRARY_PATH", "").split(":") if entry]
+    usual = [f"/usr/lib/{platform.machine()}-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
+    own = sorted(Path("/usr/lib").glob("llvm-*/lib"))  # llvm-19/lib and its like
+    return [*named, Path(sys.prefix, "lib"), *map(Path, usual), *own]
+
+
+def _point_drjit_to_llvm() -> None:
+    """Name a libLLVM that works to Dr.Jit, which loads one as soon as it is imported, and for good."""
+    if "drjit" in sys.modules or "DRJIT_LIBLLVM_PATH" in os.environ:
+        return
+    path = newest_llvm()
+    if path is not None:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(path)
+
+
+def _check_llvm(version: tuple[int, int, int] | None) -> None:
+    """Refuse a libLLVM `version` (None: not found) that would abort the process later."""
+    if version is not None and version[0] >= OLDEST_LLVM:
+        return
+    if version is None:
+        what = "Dr.Jit found no libLLVM"
+    else:
+        what = f"libLLVM {'.'.join(map(str, version))} makes Dr.Jit abort, {OLDEST_LLVM} or newer is needed"
+    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
+    where = f" (DRJIT_LIBLLVM_PATH={asked})" if asked else ""
+    better = newest_llvm()
+    if better is not None:
+        remedy = f"export DRJIT_LIBLLVM_PATH={better} and start Python again"
+    else:
+        remedy = "apt-get install libllvm19" + (" and unset DRJIT_LIBLLVM_PATH" if asked else "")
+    raise PrtError(f"{what}{where}: {remedy}")
+
+
+def _cuda_works() -> bool:
+    """Whether there are a CUDA driver, a device, and the OptiX library that Mitsuba traces rays with."""
+    import drjit as dr
+
+    # has_backend waits for the driver's start-up and answers quietly
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        return False
+    try:
+        ctypes.CDLL(os.environ.get("DRJIT_LIBOPTIX_PATH", "libnvoptix.so.1"))
+    except OSError:  # containers often carry the driver without it
+        return False
+    return True

@@ -1,0 +1,241 @@
+"""Which elements judge a matrix: at random, more often where its errors are likely to be, with weights that undo that.
+
+An element that is drawn with the probability p has the weight 1 / p, so that weighted sums over the drawn elements
+estimate, without bias, sums over all of them (Horvitz and Thompson 1952); only their variance depends on p.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mi_sparse_prt.core.bits import Bits, bit_of
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.single_elements import elements
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.transport import LightTransport
+
+RAYS = 0.002  # of the elements of a mesh, for direct light ...
+FEWEST_RAYS = 1 << 16  # ... but as many as this, or a quarter of the mesh
+FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
+AROUND = 24  # texels: 5 x 5 without the middle
+NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
+BELOW_HORIZON = 0.25  # added to the cosine where direct light is not bits alone: it may be wrong there, too
+FEW = 8  # times fewer elements in that case: hardly one is without an error
+
+PATHS = 6144  # elements for indirect light, shared out among meshes; at most 1 / 16 of a mesh ...
+FEW_PATHS = 512  # ... and as many as this where there are many meshes
+FEWEST_PATHS = 64  # ... or as many as this, where a mesh is small
+POOL = 8  # times as many, of which these are drawn
+EVEN = 0.2  # of them drawn without regard to the light that the matrix has there
+
+MEAN_COSINE = 0.25  # of max(0, n . w) over the sphere
+BLOCK = 1 << 12  # vertices at a time: some hundred trials each
+
+_NO_EDGES = np.zeros((0, 0), np.uint32), np.zeros((0, 0), np.int32)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Elements of a mesh.
+
+    Attributes
+    ----------
+    vertices, texels : (m,) int64
+        Sorted by vertex.
+    weights : (m,) float64
+        How many elements of the mesh each stands for.
+    """
+
+    vertices: NDArray[np.int64]
+    texels: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+
+def for_direct_light(
+    transport: LightTransport,
+    normals: NDArray[np.float32],
+    inside: slice,
+    rng: np.random.Generator,
+    effort: float = 1.0,
+) -> Chosen:
+    """Draw elements for direct light, at all vertices of a mesh: a few of them may hold most of the error.
+
+    At each vertex texels are drawn by cosine and solid angle. An element is seldom wrong where all bits around it
+    agree, so only some of those are kept.
+
+    Parameters
+    ----------
+    transport : LightTransport
+    normals : (n_v, 3) float32
+        Of all vertices.
+    inside : slice
+        The vertices of the mesh.
+    rng : numpy.random.Generator
+    effort : float
+        Of the usual number of elements.
+    """
+    lighting, part = transport.lighting, transport.direct
+    rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
+    floor, edges = 0.0, _NO_EDGES
+    if not isinstance(part, Visibility):
+        rays, floor = rays / FEW, BELOW_HORIZON
+    if isinstance(part, Visibility | FractionalVisibility):
+        rays /= NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES
+        nearest = min(AROUND + 1, lighting.n_directions)
+        around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
+        edges = part.bits[inside], around.astype(np.int32)
+    return _by_cosine(lighting, normals[inside], inside.start, rays, floor, edges, rng)
+
+
+def rays_of(total: int) -> float:
+    """How many elements of so many are drawn for direct light that is bits, about."""
+    return max(RAYS * total, min(total / 4, FEWEST_RAYS))
+
+
+def paths_of(total: int, n_meshes: int, effort: float = 1.0) -> int:
+    """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""
+    share = max(PATHS // n_meshes, FEW_PATHS)
+    return max(round(effort * min(share, total // 16)), min(FEWEST_PATHS, total))
+
+
+def for_indirect_light(
+    transport: LightTransport, inside: slice, rng: np.random.Generator, effort: float = 1.0
+) -> Chosen:
+    """Draw elements for indirect light, where the matrix has most of it: there its errors and the paths' noise are.
+
+    Parameters
+    ----------
+    transport : LightTransport
+        With indirect light.
+    inside : slice
+        The vertices of the mesh.
+    rng : numpy.random.Generator
+    effort : float
+        Of the usual number of elements.
+    """
+    assert transport.indirect is not None
+    total = (inside.stop - inside.start) * transport.lighting.n_directions
+    count = paths_of(total, len(transport.meshes), effort)
+    pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
+    vertices, texels = np.divmod(pool, transport.lighting.n_directions)
+    vertices += inside.start
+    light = np.abs(transport.albedo[vertices] * elements(transport.indirect, vertices, texels)).sum(axis=1)
+    mean = float(light.mean(dtype=np.float64))
+    density = EVEN + (1 - EVEN) * (light / mean if mean > 0 else np.ones(len(pool)))
+    probability = np.minimum(1.0, count / len(pool) * density.astype(np.float64))
+    kept = rng.random(len(pool)) < probability
+    return Chosen(vertices[kept], texels[kept], total / len(pool) / probability[kept])
+
+
+def _by_cosine(
+    lighting: CubemapLighting,
+    normals: NDArray[np.float32],
+    first: int,
+    count: float,
+    floor: float,
+    edges: tuple[Bits, NDArray[np.int32]],
+    rng: np.random.Generator,
+) -> Chosen:
+    """About ``count`` elements, drawn by (cosine + floor) x solid angle: random texels, kept or rejected by that.
+
+    Of those far from edges (bits, texels around each) few are kept. Vertices are counted from ``first`` on.
+    """
+    directions, areas = lighting.directions, lighting.solid_angles / lighting.solid_angles.max()
+    n, (bits, around), parts = len(normals), edges, []
+    trials = max(1, round(count * (1 + floor) / (float(areas.mean()) * (MEAN_COSINE + floor) * n)))
+    seeds = rng.integers(1 << 63, size=n, dtype=np.uint64)
+    for a in range(0, n, BLOCK):
+        block = slice(a, min(a + BLOCK, n))
+        texels, weights, counts = _kept(
+            normals[block], directions, areas, floor, bits[block], around, trials, seeds[block]
+        )
+        vertices = np.repeat(np.arange(first + a, first + block.stop), counts)
+        parts.append((vertices, *_packed(texels, weights, counts)))
+    return Chosen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+@numba.njit(parallel=True, cache=True)
+def _kept(
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    areas: NDArray[np.float32],
+    floor: float,
+    bits: Bits,
+    around: NDArray[np.int32],
+    trials: int,
+    seeds: NDArray[np.uint64],
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    """Texels and weights of the trials of each vertex that are kept, (n, trials), and how many these are, (n,)."""
+    texels, weights = np.empty((len(normals), trials), np.int32), np.empty((len(normals), trials))
+    counts = np.zeros(len(normals), np.int64)
+    for i in numba.prange(len(normals)):
+        state = seeds[i]
+        for _ in range(trials):
+            state += np.uint64(0x9E3779B97F4A7C15)
+            random = _mixed(state)
+            texel = int(((random >> np.uint64(32)) * np.uint64(len(directions))) >> np.uint64(32))
+            uniform = (random & np.uint64(0xFFFFFFFF)) / 2.0**32
+            probability = (
+                areas[texel] * (max(_cosine(normals[i], directions[texel]), 0.0) + floor) / (1 + floor)
+            )
+            if uniform >= probability:
+                continue
+            # what was below the probability is uniform again, relative to it
+            if len(around) and not _near_edge(bits[i], normals[i], directions, texel, around[texel]):
+                if uniform >= FAR_FROM_EDGES * probability:
+                    continue
+                probability *= FAR_FROM_EDGES
+            texels[i, counts[i]] = texel
+            weights[i, counts[i]] = len(directions) / (trials * probability)
+            counts[i] += 1
+    return texels, weights, counts
+
+
+@numba.njit(cache=True)
+def _packed(
+    texels: NDArray[np.int32], weights: NDArray[np.float64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The first of each row's values, as many as counted, one row after another."""
+    total, a = counts.sum(), 0
+    flat, weight = np.empty(total, np.int64), np.empty(total)
+    for i in range(len(counts)):
+        b = a + counts[i]
+        flat[a:b] = texels[i, : counts[i]]
+        weight[a:b] = weights[i, : counts[i]]
+        a = b
+    return flat, weight
+
+
+@numba.njit
+def _cosine(normal: NDArray[np.float32], direction: NDArray[np.float32]) -> float:
+    return normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2]
+
+
+@numba.njit
+def _near_edge(
+    bits: Bits,
+    normal: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    texel: int,
+    around: NDArray[np.int32],
+) -> bool:
+    """Whether a bit differs from one of those around it; below the horizon there is nothing to differ from."""
+    own = bit_of(bits, texel)
+    for j in around:
+        if bit_of(bits, j) != own and _cosine(normal, directions[j]) > 0:
+            return True
+    return False
+
+
+@numba.njit
+def _mixed(x: np.uint64) -> np.uint64:
+    """The finaliser of SplitMix64, as in ``hashing``."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))

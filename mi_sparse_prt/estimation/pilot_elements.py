@@ -1,0 +1,170 @@
+"""Random elements of T on which ways to compute a matrix are tried before there is one."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+
+SPP = 64
+STRATA = 4  # shadow rays per axis of a texel
+
+Values = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Halves:
+    """A part of white transport at some elements, twice, independently of each other.
+
+    Attributes
+    ----------
+    values : (2, k, t, channels) float64
+        At t texels of k vertices.
+    variance : (k, t, channels) float64
+        Of one sample: a path, or what a pixel of it would be. 0 where a ray tells all.
+    seconds : float
+        What a sample costs, among scattered elements.
+    """
+
+    values: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    seconds: float = 0.0
+
+
+class PilotElements:
+    """Random elements of T, evaluated twice, independently of each other and of any matrix.
+
+    With the two values X and Y, the mean of (T - X)(T - Y) estimates the squared error of a matrix T without the
+    noise of X and Y, and that of X Y the squared norm.
+
+    Parameters
+    ----------
+    scene : Scene
+    lighting : CubemapLighting
+    basis : {"direction", "texel"}
+    max_depth : int
+        As for ``precompute``.
+    indirect : bool
+        Whether there is indirect light.
+    seed : int
+        Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
+    vertices_per_mesh, texels_per_vertex : int
+
+    Attributes
+    ----------
+    sizes : (n_meshes,) integers
+        Vertices of each mesh.
+    vertices : (k,) integers
+        Sorted; of all meshes.
+    stand_for : (k,) float64
+        How many vertices of the scene each stands for.
+    texels : (k, t) integers
+        Texels held out at each vertex.
+    direct : Halves
+        One channel.
+    indirect : Halves or None
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        lighting: CubemapLighting,
+        basis: str,
+        max_depth: int,
+        indirect: bool,
+        seed: int,
+        vertices_per_mesh: int = 256,
+        texels_per_vertex: int = 32,
+    ) -> None:
+        self._scene, self.lighting, self._basis, self._seed = scene, lighting, basis, seed
+        rng = np.random.default_rng([seed, 1])
+        self.sizes = np.array([m.vertices.stop - m.vertices.start for m in scene.meshes])
+        chosen = [
+            mesh.vertices.start + np.sort(rng.choice(size, min(size, vertices_per_mesh), replace=False))
+            for mesh, size in zip(scene.meshes, self.sizes, strict=True)
+        ]
+        counts = [len(ids) for ids in chosen]
+        self.vertices = np.concatenate(chosen)
+        self.stand_for = np.repeat(self.sizes / counts, counts)
+        n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
+        self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
+        self._albedo = scene.albedo[self.vertices][:, None].astype(np.float64)  # [vertex, 1, rgb]
+        self.direct = self._direct()
+        self.indirect = self.paths(max_depth) if indirect else None
+        whole = self.direct.values + (self.indirect.values if self.indirect else 0)
+        self._norm = self._total(self._squares(*whole))
+
+    def paths(self, max_depth: int, spp: int = SPP) -> Halves:
+        """Indirect light at these elements, up to some depth."""
+        seeds = [(self._seed << 2) + k for k in (2, 3)]
+        solver = PathSolver(
+            self._scene.normalised,
+            self.lighting,
+            vertex_points(self._scene),
+            self._basis,
+            max_depth,
+            spp,
+            1 if self._scene.grey else 3,
+        )
+        power = self.lighting.solid_angles[self.texels][..., None].astype(np.float64)
+        values, variance = [], np.zeros(())
+        for seed in seeds:
+            start = time.perf_counter()  # that of the second time: the first one may have had to compile
+            found = solver.elements(*self._flat, seed)
+            seconds = (time.perf_counter() - start) / (self.texels.size * spp)
+            mean, square = (x.reshape(*self.texels.shape, -1) for x in (found.mean, found.variance))
+            values.append(mean * power)
+            variance = variance + square * power**2 * spp / len(seeds)
+        return Halves(np.stack(values), variance, seconds)
+
+    def relative_square(self, values: Values) -> float:
+        """Sum over the whole matrix of a quantity known at the held-out elements, (k, t), over its squared norm."""
+        return self._total(values) / max(self._norm, 1e-300)
+
+    def share(self, part: Halves) -> float:
+        """Norm of a part relative to that of the whole matrix."""
+        return math.sqrt(max(self.relative_square(self._squares(*part.values)), 0.0))
+
+    def squared_error(self, elements: Values) -> NDArray[np.float64]:
+        """Unbiased squared errors (k, t) of single elements (k, t, 3), summed over channels."""
+        x, y = self._albedo * (self.direct.values + (self.indirect.values if self.indirect else 0))
+        return ((elements - x) * (elements - y)).sum(axis=2)
+
+    def error_of(self, part: Halves, white: Values) -> NDArray[np.float64]:
+        """What a part's white transport (k, t, channels) adds to the squared errors (k, t), without bias."""
+        return self._squares(*(white - part.values))
+
+    def weighted(self, squares: Values) -> NDArray[np.float64]:
+        """Squares (k, t, channels) of white transport as those of T, (k, t), summed over channels."""
+        return (self._albedo**2 * squares).sum(axis=2)
+
+    def _squares(self, x: Values, y: Values) -> NDArray[np.float64]:
+        return self.weighted(x * y)
+
+    def _direct(self) -> Halves:
+        """Direct light; in the direction basis a ray tells all."""
+        solver = DirectSolver(
+            self._scene.normalised, self.lighting, vertex_points(self._scene), self._basis, STRATA
+        )
+        first, second = (
+            solver.elements(*self._flat, (self._seed << 2) + k).reshape(*self.texels.shape, 1) for k in (2, 3)
+        )
+        values = np.stack([first, second]).astype(np.float64)
+        return Halves(values, np.zeros_like(values[0]))
+
+    @property
+    def _flat(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.repeat(self.vertices, self.texels.shape[1]), self.texels.ravel()
+
+    def _total(self, values: Values) -> float:
+        """Of a quantity known at the held-out elements, (k, t), the sum over all vertices of its mean over texels."""
+        return float(self.stand_for @ values.mean(axis=1))

@@ -1,0 +1,192 @@
+"""Carries out plans: composes the methods that evaluate direct and indirect light of one scene."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+from mi_sparse_prt.core.bits import counts
+from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.methods.brute_force import exact_direct, path_traced
+from mi_sparse_prt.methods.consensus_visibility import by_consensus
+from mi_sparse_prt.methods.huang2010 import huang2010_parts
+from mi_sparse_prt.methods.plan import TOGETHER, Plan
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.methods.sparse import sparse_parts
+from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reconstruction.node_placement import choose_nodes
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.texel_edges import fractional_visibility
+from mi_sparse_prt.transport import LightTransport, MeshRange
+
+
+class Evaluation:
+    """Evaluates the matrix of a scene by one plan after another; direct light is kept for the next plan.
+
+    Parameters
+    ----------
+    scene : Scene
+    direct : DirectSolver
+        At the scene's vertices.
+    settings : Settings
+    indirect : bool
+        Whether there is indirect light.
+    clock : Stopwatch
+    progress : bool
+    checkpoint_folder : path, optional
+        Where finished rows of indirect light are kept until all are.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        direct: DirectSolver,
+        settings: Settings,
+        indirect: bool,
+        clock: Stopwatch,
+        progress: bool,
+        checkpoint_folder: str | Path | None = None,
+    ) -> None:
+        self._scene, self._solver, self._settings, self._any_indirect = scene, direct, settings, indirect
+        self._clock, self.progress, self._folder = clock, progress, checkpoint_folder
+        self._direct: dict[str, MethodResult] = {}
+
+    def parts(self, plan: Plan) -> MethodResult:
+        """The parts of the matrix, and an account of what was evaluated for them by this call."""
+        if plan.direct in TOGETHER:
+            return self._together(plan)
+        light = self.direct_light(plan.direct)
+        if plan.indirect == "none" or not self._any_indirect:
+            return light
+        return self._gathered(plan, light) if plan.indirect == "gather" else self._path_traced(plan, light)
+
+    def direct_light(self, how: str) -> MethodResult:
+        """Direct light alone; it costs nothing the second time."""
+        if how in self._direct:
+            return replace(
+                self._direct[how],
+                elements_evaluated=0,
+                elements={"direct": 0, "indirect": 0},
+                rays={"direct": 0},
+            )
+        find = {"exact": self._exact, "edges": self._edges, "consensus": self._consensus}[how]
+        self._direct[how] = find()
+        return self._direct[how]
+
+    def matrix(self, parts: MethodResult) -> LightTransport:
+        """The matrix of evaluated parts, without a report."""
+        return matrix_of(self._scene, self._solver, parts)
+
+    def _exact(self) -> MethodResult:
+        return exact_direct(self._solver, self._scene, self._clock, self.progress)
+
+    def _consensus(self) -> MethodResult:
+        state = by_consensus(self._scene, self._solver, self._clock)
+        rays = int(counts(state.evaluated).sum())
+        bits = Visibility(state.visible, self._scene.normals, self._solver.lighting)
+        return MethodResult(bits, None, rays, {"direct": rays, "indirect": 0}, {"direct": rays})
+
+    def _edges(self) -> MethodResult:
+        """All texels' centres, and where visibility changes between these."""
+        solver = DirectSolver(self._scene.normalised, self._solver.lighting, self._solver.points)
+        centres = exact_direct(solver, self._scene, self._clock, self.progress)
+        assert isinstance(centres.direct, Visibility)
+        with self._clock.phase("edges"):
+            part, rays = fractional_visibility(solver, centres.direct.bits)
+        return replace(centres, direct=part, rays={"direct": centres.rays["direct"] + rays})
+
+    def _gathered(self, plan: Plan, light: MethodResult) -> MethodResult:
+        """With interreflections by finite elements."""
+        solver, settings = self._solver, self._settings
+        with self._clock.phase("gather_rays"):
+            nodes = choose_nodes(self._scene, solver.points)
+            gather = RadiositySolver(
+                self._scene,
+                solver.lighting,
+                solver.points,
+                plan.rays,
+                settings.max_depth,
+                settings.seed,
+                nodes,
+            )
+        with self._clock.phase("interreflection"):
+            part = gather.indirect(light.direct, plan.tolerance)
+        skipped = [
+            f"interreflections after {part.bounces}: next to no light",
+            f"singular values of the first bounce below {part.left_out:.1%} of its energy's root",
+        ]
+        rays = light.rays | {"gather": gather.rays}
+        return replace(light, indirect=part, rays=rays, skipped=skipped)
+
+    def _path_traced(self, plan: Plan, light: MethodResult) -> MethodResult:
+        """With paths for all elements."""
+        paths, lighting = self._paths(plan), self._solver.lighting
+        part = path_traced(paths, lighting, self._clock, self.progress, self._checkpoint(plan))
+        elements = len(paths.points) * paths.lighting.n_directions
+        return replace(
+            light,
+            indirect=part,
+            elements_evaluated=max(light.elements_evaluated, elements),
+            elements=light.elements | {"indirect": elements},
+            rays=light.rays | {"indirect_paths": elements * paths.spp},
+        )
+
+    def _together(self, plan: Plan) -> MethodResult:
+        """Both parts by a method that evaluates them at the same elements."""
+        paths = self._paths(plan) if self._any_indirect else None
+        seed, checkpoint = self._settings.seed, self._checkpoint(plan)
+        if plan.direct == "huang2010":
+            return huang2010_parts(
+                self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint
+            )
+        return sparse_parts(
+            self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint, plan.dense
+        )
+
+    def _paths(self, plan: Plan) -> PathSolver:
+        return indirect_solver(self._scene, self._settings.of(plan))
+
+    def _checkpoint(self, plan: Plan) -> Path | None:
+        """A file name that stands for all that the rows of the indirect light, and their order, depend on."""
+        if self._folder is None:
+            return None
+        state = (
+            f"{self._scene.hash} {self._settings.of(plan)} {plan}".encode()
+            + self._solver.points.keys.tobytes()
+        )
+        return Path(self._folder) / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
+
+
+def matrix_of(scene: Scene, direct: DirectSolver, parts: MethodResult) -> LightTransport:
+    """The matrix of parts that were evaluated at a scene's vertices, without a report."""
+    return LightTransport(
+        lighting=direct.lighting,
+        basis=direct.basis,
+        albedo=scene.albedo,
+        areas=scene.vertex_areas,
+        direct=parts.direct,
+        indirect=parts.indirect,
+        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
+        vertex_keys=direct.points.keys,
+        scene_hash=scene.hash,
+    )
+
+
+def indirect_solver(scene: Scene, settings: Settings) -> PathSolver:
+    """The path tracer that settings ask for, at the scene's vertices."""
+    return PathSolver(
+        scene.normalised,
+        settings.coarse,
+        vertex_points(scene),
+        settings.indirect_basis,
+        settings.max_depth,
+        settings.samples,
+        1 if scene.grey else 3,
+        settings.seed,
+    )

@@ -1,0 +1,98 @@
+"""The arguments of a precomputation, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.methods.plan import BY_NAME, Plan
+
+METHODS = ("auto", *BY_NAME)
+BASES = ("direction", "texel")
+SPP = 16
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a matrix depends on besides the scene; the parameters of ``precompute``.
+
+    Raises
+    ------
+    PrtError
+        If a value makes no sense.
+    """
+
+    resolution: int
+    method: str | Plan = "auto"
+    basis: str = "direction"
+    max_depth: int = 5
+    spp: int | None = None
+    target_error: float | None = None
+    seed: int = 0
+    indirect_resolution: int | None = None
+    strata: int = 2
+
+    def __post_init__(self) -> None:
+        if isinstance(self.method, str) and self.method not in METHODS:
+            raise PrtError(f"unknown method {self.method!r}; choose one of: {', '.join(METHODS)}")
+        if self.plan is not None:
+            self._check_plan(self.plan)
+        if self.target_error is not None and self.method == "huang2010":
+            raise PrtError(
+                'method "huang2010" has the rates of the paper and aims at no target error; leave it out, '
+                'or set method="sparse"'
+            )
+        if self.basis not in BASES:
+            raise PrtError(f"unknown basis {self.basis!r}; choose one of: {', '.join(BASES)}")
+        for name, least in (("samples", 1), ("strata", 1), ("seed", 0), ("max_depth", -1)):
+            value = getattr(self, name)
+            name = "spp" if name == "samples" else name
+            if value != int(value) or value < least:
+                raise PrtError(f"{name} is {value}; it must be a whole number of at least {least}")
+        if self.max_depth < 2 and self.max_depth != -1:
+            raise PrtError(f"max_depth is {self.max_depth}; 2 is direct light only, -1 is no limit")
+        if self.target_error is not None and not self.target_error > 0:
+            raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
+        if self.coarse.resolution > self.resolution:
+            raise PrtError(
+                f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
+                f"use at most {self.resolution}"
+            )
+
+    def _check_plan(self, plan: Plan) -> None:
+        name = self.method if isinstance(self.method, str) else "Plan"
+        basis = {"exact": self.basis, "edges": "texel"}.get(plan.direct, "direction")
+        if self.basis != basis:
+            raise PrtError(f'method {name!r} works in the {basis} basis; set basis="{basis}"')
+        if plan.indirect != "paths" and self.indirect_resolution not in (None, self.resolution):
+            raise PrtError(
+                f"method {name!r} chooses the directions of the indirect light itself; leave indirect_resolution out"
+            )
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan that the method stands for, None if it is to be chosen."""
+        return self.method if isinstance(self.method, Plan) else BY_NAME.get(self.method)
+
+    def of(self, plan: Plan) -> Settings:
+        """These, with the samples and the resolution of the indirect light that a plan has."""
+        resolution = (plan.resolution or self.indirect_resolution) if plan.indirect == "paths" else None
+        return replace(self, spp=plan.spp or self.samples, indirect_resolution=resolution)
+
+    @property
+    def samples(self) -> int:
+        """Paths per element, where nothing else says how many."""
+        return SPP if self.spp is None else self.spp
+
+    @property
+    def coarse(self) -> CubemapLighting:
+        """The cubemap on which indirect light is computed."""
+        return CubemapLighting(
+            self.resolution if self.indirect_resolution is None else self.indirect_resolution
+        )
+
+    @property
+    def indirect_basis(self) -> str:
+        """A coarse element stands for all directions in its texel, whatever the basis."""
+        return self.basis if self.coarse.resolution == self.resolution else "texel"

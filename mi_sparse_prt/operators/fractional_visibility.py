@@ -1,0 +1,239 @@
+"""Direct light in the texel basis, as the visible share of each texel: nearly always all of it or nothing.
+
+``T = share * mean of max(0, n . w) over the texel * solid angle / pi``. The mean is analytic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.bits import BITS, bit_of
+from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+
+FULL = 255  # a share of 1
+_PARTS = 256  # of a face per axis, over which directions are averaged
+
+Ids = NDArray[np.integer]
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FractionalVisibility:
+    """One bit per element, and 8 more where an edge of visibility cuts the texel.
+
+    Attributes
+    ----------
+    bits : (n_v, ceil(n_directions / 32)) uint32
+        Whether texels are seen: bit j % 32 of word j // 32.
+    starts : (n_v + 1,) int64
+        Where the texels of each vertex that are seen in part begin in the next two arrays.
+    texels : (m,) uint16 or uint32
+        Ascending for each vertex.
+    shares : (m,) uint8
+        What is seen of these texels, whatever their bits are; 255 is all.
+    normals : (n_v, 3) float32, world
+    lighting : CubemapLighting
+    """
+
+    bits: NDArray[np.uint32]
+    starts: NDArray[np.int64]
+    texels: NDArray[np.unsignedinteger]
+    shares: NDArray[np.uint8]
+    normals: Floats
+    lighting: CubemapLighting
+
+    @property
+    def nbytes(self) -> int:
+        return self.bits.nbytes + self.starts.nbytes + self.texels.nbytes + self.shares.nbytes
+
+    def rows(self, ids: Ids) -> Floats:
+        return self.reordered(ids)._expanded(np.arange(self.lighting.n_directions))
+
+    def columns(self, ids: Ids) -> Floats:
+        distinct, place = np.unique(np.asarray(ids, np.int64), return_inverse=True)
+        columns = self._expanded(distinct)
+        return columns if np.array_equal(distinct, ids) else columns[:, place]
+
+    def relight(self, lighting: Floats) -> Floats:
+        directions, ramps = _means(self.lighting.resolution)
+        power = np.zeros((3, len(ramps)), np.float32)
+        power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
+        listed = self.starts, self.texels, self.shares
+        return _relight(self.bits, *listed, self.normals, directions, ramps, power)
+
+    def project(self, vectors: Floats) -> Floats:
+        return rows_times(self.rows, len(self.bits), vectors)
+
+    def reordered(self, source: Ids) -> FractionalVisibility:
+        """Some rows, in this order."""
+        source = np.asarray(source)
+        counts = np.diff(self.starts)[source]
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        entries = np.arange(starts[-1]) + np.repeat(self.starts[:-1][source] - starts[:-1], counts)
+        return replace(
+            self,
+            bits=self.bits[source],
+            starts=starts,
+            texels=self.texels[entries],
+            shares=self.shares[entries],
+            normals=self.normals[source],
+        )
+
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        """White elements (m,) of vertices and texels (m,) each."""
+        beams = *_means(self.lighting.resolution), self._weights()
+        asked = np.asarray(ids, np.int64), np.asarray(texels, np.int64)
+        return _single(self.bits, self.starts, self.texels, self.shares, self.normals, *beams, *asked)
+
+    def _expanded(self, ids: Ids) -> Floats:
+        """Elements (n_v, k, 1) of texels (k,), no texel twice."""
+        directions, ramps = _means(self.lighting.resolution)
+        place = np.full(self.lighting.n_directions, -1)
+        place[ids] = np.arange(len(ids))
+        beams = np.ascontiguousarray(directions[:, ids]), ramps[ids], self._weights()[ids]
+        result = np.empty((len(self.bits), len(ids)), np.float32)
+        listed = self.starts, self.texels, self.shares
+        _expand(self.bits, *listed, self.normals, np.asarray(ids, np.int64), *beams, place, result)
+        return result[..., None]
+
+    def _weights(self) -> Floats:
+        return self.lighting.solid_angles / np.float32(np.pi)
+
+
+@cache
+def _means(resolution: int) -> tuple[Floats, Floats]:
+    """Mean directions (3, padded to whole words) and ramps (padded,) of a cubemap's texels.
+
+    Over a texel n . w is between its mean m and m +- the ramp, evenly: near enough for the few texels that the horizon
+    cuts, exact for all others. The ramp has the variance of w along a random normal at right angles to it.
+    """
+    lighting = CubemapLighting(resolution)
+    parts, areas = lighting.subdirections(max(4, _PARTS // resolution))
+    weights = (areas / areas.sum(axis=1, keepdims=True)).astype(np.float64)
+    mean = np.einsum("jk,jkd->jd", weights, parts)
+    variance = np.einsum("jk,jkd->j", weights, (parts - mean[:, None]) ** 2) / 2
+    padded = -(-lighting.n_directions // BITS) * BITS
+    directions, ramps = np.zeros((3, padded), np.float32), np.ones(padded, np.float32)
+    directions[:, : len(mean)] = mean.T
+    ramps[: len(mean)] = np.sqrt(3 * variance)
+    return directions, ramps
+
+
+@numba.njit(fastmath=True, inline="always")
+def _mean_cosine(cosine: np.float32, ramp: np.float32) -> np.float32:
+    """Mean of max(0, x) for x evenly between cosine - ramp and cosine + ramp; without a branch."""
+    above = min(max(cosine + ramp, np.float32(0)), np.float32(2) * ramp)
+    return above * above / (np.float32(4) * ramp) + max(cosine - ramp, np.float32(0))
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _relight(
+    bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
+    normals: Floats,
+    directions: Floats,
+    ramps: Floats,
+    power: Floats,
+) -> Floats:
+    """Sum of power[:, j] times the share and the mean cosine of texel j; the inner loop is one word of bits."""
+    radiance = np.zeros((bits.shape[0], 3), dtype=np.float32)
+    for i in numba.prange(bits.shape[0]):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+        for word in range(bits.shape[1]):
+            mask = bits[i, word]
+            if mask == 0:
+                continue
+            for k in range(32):
+                j = word * 32 + k
+                cosine = nx * directions[0, j] + ny * directions[1, j] + nz * directions[2, j]
+                bit = np.float32((mask >> np.uint32(k)) & np.uint32(1))
+                seen = _mean_cosine(cosine, ramps[j]) * bit
+                red += seen * power[0, j]
+                green += seen * power[1, j]
+                blue += seen * power[2, j]
+        for e in range(starts[i], starts[i + 1]):
+            j = texels[e]
+            cosine = nx * directions[0, j] + ny * directions[1, j] + nz * directions[2, j]
+            more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[i], j))
+            seen = _mean_cosine(cosine, ramps[j]) * more
+            red += seen * power[0, j]
+            green += seen * power[1, j]
+            blue += seen * power[2, j]
+        radiance[i, 0], radiance[i, 1], radiance[i, 2] = red, green, blue
+    return radiance
+
+
+@numba.njit(parallel=True, cache=True)
+def _expand(
+    bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
+    normals: Floats,
+    ids: NDArray[np.int64],
+    directions: Floats,
+    ramps: Floats,
+    weights: Floats,
+    place: NDArray[np.int64],
+    result: Floats,
+) -> None:
+    """Elements of texels ``ids``, in ascending order of columns; ``place`` says which column a texel has, or -1.
+
+    Directions, ramps and weights are those of ``ids``.
+    """
+    for i in numba.prange(len(bits)):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        for c in range(len(ids)):
+            cosine = nx * directions[0, c] + ny * directions[1, c] + nz * directions[2, c]
+            seen = np.float32(bit_of(bits[i], ids[c]))
+            result[i, c] = seen * _mean_cosine(cosine, ramps[c]) * weights[c]
+        if len(ids) == 0:
+            continue
+        own = texels[starts[i] : starts[i + 1]]
+        for e in range(starts[i] + np.searchsorted(own, ids[0]), starts[i + 1]):
+            if texels[e] > ids[-1]:
+                break
+            c = place[texels[e]]
+            if c >= 0:
+                cosine = nx * directions[0, c] + ny * directions[1, c] + nz * directions[2, c]
+                share = np.float32(shares[e]) / np.float32(FULL)
+                result[i, c] = share * _mean_cosine(cosine, ramps[c]) * weights[c]
+
+
+@numba.njit(parallel=True, cache=True)
+def _single(
+    bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    texels: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
+    normals: Floats,
+    directions: Floats,
+    ramps: Floats,
+    weights: Floats,
+    ids: NDArray[np.int64],
+    asked: NDArray[np.int64],
+) -> Floats:
+    """Elements of vertices ``ids`` and texels ``asked``."""
+    result = np.empty(len(ids), np.float32)
+    for m in numba.prange(len(ids)):
+        i, j = ids[m], asked[m]
+        cosine = np.float32(0)
+        for d in range(3):
+            cosine += normals[i, d] * directions[d, j]
+        own = texels[starts[i] : starts[i + 1]]
+        e = np.searchsorted(own, j)
+        if e < len(own) and own[e] == j:
+            share = np.float32(shares[starts[i] + e]) / np.float32(FULL)
+        else:
+            share = np.float32(bit_of(bits[i], j))
+        result[m] = share * _mean_cosine(cosine, ramps[j]) * weights[j]
+    return result

@@ -1,0 +1,149 @@
+"""Which plan comes first, and which one after a plan that missed the target error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from mi_sparse_prt.methods.plan import EFFORTS, Plan
+from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.choice import (
+    TARGET,
+    Costs,
+    Predicted,
+    better,
+    choose,
+    choose_first,
+    finer,
+    learned,
+    predictions,
+    uncertain,
+)
+from mi_sparse_prt.planner.direct_costs import DirectCost
+
+ATTEMPTS = 4
+PATIENCE = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
+
+
+class Ladder:
+    """Plans in turn.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+
+    Attributes
+    ----------
+    plan : Plan
+        The present one.
+    seconds : float or None
+        What it is predicted to take in all.
+    too_long : None
+        See ``Ranking``.
+    """
+
+    seconds: float | None = None
+    too_long: Predicted | None = None
+
+    def __init__(self, plans: Sequence[Plan]) -> None:
+        self.plan, *self._others = plans
+
+    def after(self, error: float) -> bool:
+        """Go on to the next plan, the present one having this error; False if there is none."""
+        if self._others:
+            self.plan = self._others.pop(0)
+            return True
+        return False
+
+    def report(self) -> list[dict[str, Any]]:
+        """Plans that were compared."""
+        return []
+
+
+class Ranking:
+    """Plans by what was measured; attributes and methods of the same name are those of ``Ladder``.
+
+    Parameters
+    ----------
+    costs : Costs
+    settings : Settings
+
+    Attributes
+    ----------
+    too_long : Predicted or None
+        A plan that would meet the target after all, and would take very long.
+    """
+
+    too_long: Predicted | None = None
+
+    def __init__(self, costs: Costs, settings: Settings) -> None:
+        self._settings = settings
+        self._rank(costs)
+
+    def _rank(self, costs: Costs) -> None:
+        settings = self._settings
+        self._costs = costs
+        self._plans = predictions(costs, settings.target_error or TARGET, settings.spp)
+        # errors of paths are predicted too well for a trial to turn out better
+        begin = choose_first if settings.method == "auto" else choose
+        self._best = begin(self._plans, settings.target_error)
+        self._tried = [self._best]
+
+    @property
+    def plan(self) -> Plan:
+        """The present one."""
+        return self._best.plan
+
+    @property
+    def seconds(self) -> float:
+        """What it is predicted to take in all."""
+        return self._best.seconds
+
+    @property
+    def uncertain(self) -> str | None:
+        """Direct light to find and to judge before anything else, as the choice depends on it."""
+        return uncertain(self._costs, self._settings.target_error, self._settings.spp)
+
+    def judged(self, direct: str, error: float) -> None:
+        """Choose again, now that this direct light has been found and its error, relative to all of it, is known."""
+        costs = self._costs
+        found = DirectCost(0.0, costs.direct_share * error)
+        fixed = costs.fixed + costs.direct[direct].seconds
+        self._rank(replace(costs, fixed=fixed, direct=costs.direct | {direct: found}))
+
+    def after(self, error: float) -> bool:
+        """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
+
+        Where what would meet the target takes too long, the next one is at least clearly more exact.
+        """
+        settings, target = self._settings, self._settings.target_error
+        if target is None or len(self._tried) == ATTEMPTS:
+            return False
+        plans = finer(self._costs, self._best, error, target, settings.spp)
+        self._costs = learned(self._costs, self._best.plan, error)
+        patience = PATIENCE * self._tried[0].seconds
+        found = choose(plans, target) if plans else None
+        if found is not None and found.seconds > patience:
+            self.too_long = found if found.error <= target else None
+            found = better(plans, error, patience)
+        if found is None:
+            return False
+        self._best = found
+        self._plans.append(found)
+        self._tried.append(found)
+        return True
+
+    def report(self) -> list[dict[str, Any]]:
+        """Plans that were compared, the quickest first; those that were carried out are the chosen ones."""
+        unique = {p.plan: p for p in self._plans}.values()
+        tried = [p.plan for p in self._tried]
+        return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
+
+
+def ladder(settings: Settings) -> Ladder:
+    """The plan of a method; with a target error, from the coarsest of its plans on."""
+    assert settings.plan is not None
+    if settings.target_error is None or isinstance(settings.method, Plan):
+        return Ladder([settings.plan])
+    return Ladder(EFFORTS.get(settings.method, (settings.plan,)))

@@ -1,0 +1,92 @@
+"""Weights of a vertex's dense neighbours that interpolate: linear in position and normal, or by distance."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.measurement.neighbours import Neighbours
+
+GAUSSIANS = 1.5  # standard deviations (times sqrt 2) at which the farthest neighbour of linear weights is
+NORMAL_UNIT = 2.0  # slopes in normals count from differences of half a unit on
+RIDGE = 0.3  # of slopes, in squared steps between dense vertices
+
+
+def linear_weights(
+    neighbours: Neighbours,
+    positions: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    dense_positions: NDArray[np.floating],
+    dense_normals: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Weights (n, k) of neighbours that reproduce what is linear in position and normal; rows sum to 1.
+
+    Moving least squares: the value at the point of the linear function that fits the neighbours best, each counting
+    with a Gaussian of its distance. A ridge on the slopes keeps weights bounded where neighbours do not span them
+    (on a line, on a plane, all in one place), and turns to the plain mean there.
+
+    Parameters
+    ----------
+    neighbours : Neighbours
+        Of ``surface_neighbours``.
+    positions, normals : (n, 3) float
+    dense_positions, dense_normals : (n_dense, 3) float
+
+    Returns
+    -------
+    (n, k) float32
+        0 where there is no neighbour.
+    """
+    return _linear_weights(
+        neighbours.ids,
+        neighbours.distances,
+        np.hstack([positions, normals]),
+        np.hstack([dense_positions, dense_normals]),
+    )
+
+
+@numba.njit(parallel=True, cache=True)
+def _linear_weights(
+    ids: NDArray[np.int32],
+    distances: NDArray[np.float32],
+    points: NDArray[np.floating],
+    dense: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Of points (n, 6) and dense vertices (m, 6), each a position and a normal."""
+    weights = np.zeros(ids.shape, np.float32)
+    for i in numba.prange(len(ids)):
+        count = 0
+        while count < ids.shape[1] and ids[i, count] >= 0:
+            count += 1
+        if count == 0:
+            continue
+        reach = max(np.float64(distances[i, count - 1]) / GAUSSIANS, 1e-30)
+        near = np.exp(-((distances[i, :count] / reach) ** 2))
+        near /= near.sum()
+        terms = np.empty((count, 6))  # [neighbour, slope]
+        for k in range(count):
+            for c in range(6):
+                unit = max(reach / GAUSSIANS, 1e-30) if c < 3 else 1 / NORMAL_UNIT
+                terms[k, c] = (dense[ids[i, k], c] - points[i, c]) / unit
+        mean = near @ terms
+        weighted = (terms - mean) * near.reshape(-1, 1)
+        system = weighted.T @ (terms - mean) + RIDGE * np.eye(6)
+        weights[i, :count] = near - weighted @ np.linalg.solve(system, mean)
+    return weights
+
+
+def inverse_distance_weights(neighbours: Neighbours) -> NDArray[np.float32]:
+    """Weights (n, k) of neighbours by the inverse of their distance; rows sum to 1, or are 0 where there are none.
+
+    At a point that coincides with dense vertices they alone count.
+    """
+    near = neighbours.distances.astype(np.float64)  # [point, neighbour]
+    present = neighbours.ids >= 0
+    nearest = np.min(near, axis=1, keepdims=True, initial=np.inf, where=present)
+    # relative to the nearest: 1 for it, and no division by 0 where it coincides
+    weights = np.where(present & (near <= nearest), 1.0, 0.0)
+    np.divide(nearest, near, out=weights, where=present & (near > nearest))
+    total = weights.sum(axis=1, keepdims=True)
+    np.divide(weights, total, out=weights, where=total > 0)
+    return weights.astype(np.float32)

@@ -1,0 +1,131 @@
+"""As many factors as asked for, found again on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.io.atomic import write_atomically
+from mi_sparse_prt.io.cache_folder import cache_folder
+from mi_sparse_prt.reflection.brdf_factors.diffuse_part import evaluated, probes
+from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
+from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, factor_error
+from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
+from mi_sparse_prt.scene.materials import Material
+
+FORMAT = 1  # of the files; another one whenever factors of the same BSDF would be others
+
+
+def factors_of(
+    bsdf: mi.BSDF,
+    name: str,
+    terms: int = 4,
+    target_error: float | None = None,
+    folder: Path | None = None,
+) -> BrdfFactors:
+    """Factor a reflective BSDF, or find the factors that an earlier call left in a folder.
+
+    Parameters
+    ----------
+    bsdf : mi.BSDF
+        Its front is factored. A diffuse part that varies over the surface is left to the caller, see `BrdfFactors`.
+    name : str
+        For messages.
+    terms : int
+        K, 1 to 16; [HR10] takes 4. Fewer if one would be without its partner (``BrdfFactors.complete``).
+    target_error : float, optional
+        Relative L2 error over all pairs of directions, as ``factor_error`` measures it: the fewest terms that meet it,
+        instead of ``terms``. If 16 do not, they are taken, and a `PrtWarning` says how far they are.
+    folder : Path, optional
+        Made if it does not exist; the default is ``brdf`` in ``io.cache_folder()``. Files in it, 1 or 2 MB each,
+        may be deleted at any time; one is found by all that the BSDF shows of itself, whatever its shape's name.
+
+    Returns
+    -------
+    BrdfFactors
+
+    Raises
+    ------
+    PrtError
+        If ``terms`` is out of range, and as ``factor_brdf``.
+    """
+    if not 1 <= terms <= MOST_TERMS:
+        raise PrtError(f"shape '{name}': {terms} factors of its BRDF; give 1 to {MOST_TERMS}")
+    factors, error = _found_or_made(bsdf, name, folder or cache_folder() / "brdf")
+    if target_error is None:
+        return factors.complete(terms)
+    enough = error.terms_for(target_error)
+    if enough is None:
+        warnings.warn(
+            f"shape '{name}': {MOST_TERMS} factors of its BRDF have an error of {error.whole[-1]:.1%}, more than "
+            f"{target_error:.1%}; all are taken, ask for a larger error or use path tracing",
+            PrtWarning,
+            stacklevel=2,
+        )
+    return factors.first(enough or MOST_TERMS)
+
+
+def _found_or_made(bsdf: mi.BSDF, name: str, folder: Path) -> tuple[BrdfFactors, FactorError]:
+    """All terms and their errors."""
+    grid = DirectionGrid()
+    path = folder / f"{_key(bsdf, name, grid)}.npz"
+    found = _read(path, grid)
+    if found:
+        return found
+    factors = factor_brdf(bsdf, name, MOST_TERMS, grid)
+    error = factor_error(factors, bsdf, name)
+    try:
+        _write(path, factors, error)
+    except OSError as problem:  # the result is good, only not kept
+        warnings.warn(f"cache of BRDF factors: {problem}", PrtWarning, stacklevel=3)
+    return factors, error
+
+
+def _key(bsdf: mi.BSDF, name: str, grid: DirectionGrid) -> str:
+    """Of all that the BSDF shows, and of some values, as plugins may show too little of themselves."""
+    carrier = mi.load_dict({"type": "rectangle", "bsdf": bsdf})  # what materials are read from
+    shown = Material(carrier, name, []).digest()
+    state = hashlib.sha256(json.dumps([FORMAT, MOST_TERMS, grid.heights, grid.azimuths]).encode())
+    state.update(shown + evaluated(bsdf, name, *probes()).tobytes())
+    return state.hexdigest()[:32]
+
+
+def _read(path: Path, grid: DirectionGrid) -> tuple[BrdfFactors, FactorError] | None:
+    """None if the file is missing or damaged."""
+    try:
+        with np.load(path) as file:  # a zip archive: each array has its checksum
+            kept: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
+        factors = BrdfFactors(
+            grid, kept["diffuse"], kept["incident"], kept["outgoing"], bool(kept["varying_diffuse"])
+        )
+        return factors, FactorError(kept["whole"], kept["grazing"], kept["peak"])
+    except Exception:  # damage raises whatever the damaged bytes lead to; what is not found is made again
+        return None
+
+
+def _write(path: Path, factors: BrdfFactors, error: FactorError) -> None:
+    """Nothing is left under the name if it fails."""
+    arrays: dict[str, Any] = {
+        "diffuse": factors.diffuse,
+        "incident": factors.incident,
+        "outgoing": factors.outgoing,
+        "varying_diffuse": np.array(factors.varying_diffuse),
+        "whole": error.whole,
+        "grazing": error.grazing,
+        "peak": error.peak,
+    }
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # a path would be given another suffix
+            np.savez(file, **arrays)
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, write)

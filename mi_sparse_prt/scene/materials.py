@@ -1,0 +1,172 @@
+"""R, as far as the vertices know it: what a shape's BSDF reflects, and what can be proved about its colours."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.tessellation import TriangleMesh
+
+#: Samples per vertex for the directional albedo of a BSDF that is not diffuse (stratified, 8 x 8).
+ALBEDO_STRATA = 8
+
+#: BSDFs and textures that do not vary over the surface nor with its rotation.
+PLAIN = {"SmoothDiffuse", "TwoSided", "UniformSpectrum", "SRGBReflectanceSpectrum"}
+
+#: BSDFs and textures whose colours are all among the parameters that `mi.traverse` shows.
+SHOWN = PLAIN | {"BlendBSDF", "Mask", "Null", "SmoothPlastic", "RoughPlastic", "SmoothDielectric"}
+SHOWN |= {"RoughDielectric", "ThinDielectric", "SmoothConductor", "RoughConductor"}
+SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
+
+#: BSDFs that bend the shading normal of the one that they wrap.
+BUMPED = {"NormalMap", "BumpMap"}
+
+
+def kind(bsdf: mi.BSDF) -> str:
+    """The class of a BSDF, also of one that is written in Python."""
+    own = type(bsdf).__name__
+    return own if own != "BSDF" else str(bsdf.class_name())
+
+
+class Material:
+    """A shape's BSDF, and what can be said about it.
+
+    Attributes
+    ----------
+    name : str
+        The shape's name, for messages.
+    bsdf : mi.BSDF
+    diffuse : bool
+        It reflects diffusely and does nothing else.
+    one_sided : bool
+        It is black from behind.
+    constant : bool
+        It certainly does not vary over the surface nor with its rotation.
+    """
+
+    def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
+        self.name = name
+        self.bsdf: mi.BSDF = shape.bsdf()
+        self._emitter = shape.emitter() if shape.is_emitter() else None
+        self._text = re.sub(r" at 0x[0-9a-f]+", "", str(self.bsdf))  # no addresses of Python plugins
+        # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
+        self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
+        flags = int(self.bsdf.flags())
+        scatter = flags & int(mi.BSDFFlags.All)
+        self.one_sided = not flags & int(mi.BSDFFlags.BackSide)
+        bumped = bool(self._classes & BUMPED)
+        self._lambertian = scatter == int(mi.BSDFFlags.DiffuseReflection)
+        self.diffuse = self._lambertian and not bumped
+        self.constant = self._classes <= PLAIN
+        if not self.diffuse:
+            what = "bends the shading normals" if self._lambertian else "is not diffuse"
+            notes.append(
+                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; matrices treat its vertices as diffuse "
+                "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
+            )
+        if self._emitter is not None:
+            notes.append(f"shape '{name}' is an area emitter: it does not take part in the transport matrix")
+        if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+            notes.append(
+                f"shape '{name}' bounds a medium: media are left out, light passes as through a vacuum"
+            )
+
+    def emission(self) -> mi.Emitter | None:
+        """A copy of the shape's area emitter for another shape; None if it has none or a textured one."""
+        if self._emitter is None:
+            return None
+        values = mi.traverse(self._emitter)
+        if "radiance.value" not in values:
+            return None
+        radiance = np.ravel(values["radiance.value"]).astype(float)
+        spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
+        return mi.load_dict({"type": "area", "radiance": spectrum})
+
+    def albedo(self, shape: mi.Mesh, mesh: TriangleMesh) -> NDArray[np.float32]:
+        """(n, 3) reflectance at the vertices of `mesh`, evaluated by Mitsuba on its twin `shape`.
+
+        Each vertex is looked at in the corner of one of its triangles, from the direction of its normal.
+        """
+        n = len(mesh.positions)
+        corner_of = np.zeros(n, np.int64)  # [vertex] -> index into the flattened triangles
+        flat = mesh.triangles.ravel()
+        corner_of[flat[::-1]] = np.arange(len(flat))[::-1]
+        triangle, corner = np.divmod(corner_of, 3)
+
+        pi = dr.zeros(mi.PreliminaryIntersection3f, n)
+        pi.prim_index = mi.UInt32(triangle.astype(np.uint32))
+        pi.prim_uv = mi.Point2f(
+            mi.Float((corner == 1).astype(np.float32)), mi.Float((corner == 2).astype(np.float32))
+        )
+        pi.shape = mi.ShapePtr(shape)
+        pi.t = mi.Float(1.0)
+        ray = dr.zeros(mi.Ray3f, n)
+        si = shape.compute_surface_interaction(ray, pi)
+        si.t = mi.Float(1.0)
+        si.wi = mi.Vector3f(0, 0, 1)
+        value = self.bsdf.eval_diffuse_reflectance(si) if self._lambertian else self._directional_albedo(si)
+        albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
+        bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
+        if bad.size:
+            raise PrtError(
+                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} "
+                f"({bad.size} such vertices): reflectance must lie in 0..1"
+            )
+        return np.ascontiguousarray(np.minimum(albedo, 1))
+
+    def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
+        """The share of light from the normal's direction that is scattered: a mean of stratified samples."""
+        context = mi.BSDFContext()
+        total = dr.zeros(mi.Color3f, dr.width(si))
+        n = ALBEDO_STRATA
+        for k in range(n * n):
+            # The lobe's random number runs in bit-reversed order, so that each lobe sees the whole square.
+            lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n
+            lobe, x, y = (dr.opaque(mi.Float, value) for value in (lobe, x, y))  # one kernel for all strata
+            u = mi.Point2f(x, y)
+            _, weight = self.bsdf.sample(context, si, lobe, u)
+            total += mi.Color3f(weight)
+            dr.eval(total)
+        return dr.clip(total / (n * n), 0, 1)
+
+    def grey(self, mesh: TriangleMesh) -> bool:
+        """Whether the BSDF provably reflects the three channels alike."""
+        if not self._classes <= SHOWN:
+            return False
+        if "MeshAttribute" in self._classes and not all(
+            _even(values) for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
+        ):
+            return False
+        parameters = mi.traverse(self.bsdf)
+        return all(_even(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
+
+    def digest(self) -> bytes:
+        """SHA-256 of the BSDF's text and of all parameters that `mi.traverse` shows, bitmaps included."""
+        state = hashlib.sha256(self._text.encode())
+        parameters = mi.traverse(self.bsdf)
+        for name in sorted(parameters.keys()):
+            value = parameters[name]
+            state.update(name.encode())
+            state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
+        return state.digest()
+
+
+def _even(value: Any) -> bool:
+    """Whether colours, a `mi.Color3f` or [..., channel], have equal channels; other things always do."""
+    values = np.array(value, np.float64)
+    if isinstance(value, mi.Color3f):
+        values = values.T  # [1, channel]
+    if values.ndim < 2 or values.shape[-1] not in (3, 4):
+        return True
+    return bool(np.all(np.ptp(values[..., :3], axis=-1) <= 1e-6))
+
+
+def _radical_inverse(k: int, bits: int = 6) -> float:
+    return int(f"{k:0{bits}b}"[::-1], 2) / 2**bits

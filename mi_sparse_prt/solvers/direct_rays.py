@@ -1,0 +1,169 @@
+"""V and R for direct light: visibility towards the texels of the lighting by ray tracing ([Leh07] 2.2, [HR10] eq. 1).
+
+The result is stored as what cannot be computed analytically: one bit per element in the direction basis (the cosine
+and the solid angle are analytic), a 16-bit mean cosine in the texel basis.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.texel_arrays import TexelArrays
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.operators.mean_cosine import FIXED_POINT
+
+LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
+
+
+class DirectSolver:
+    """Direct light at points of a scene, one element per point and texel.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Normalised copy without emitters.
+    lighting : CubemapLighting
+    points : Points
+    basis : {"direction", "texel"}
+        Visibility towards the texel's centre, or the cosine-weighted mean over stratified directions in the texel
+        (``solvers.texel_edges`` gets nearly as near to that with few more rays than centres take).
+    strata : int
+        Texel basis: strata per axis of a texel; strata**2 rays per element, each at a random place of its stratum.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        lighting: CubemapLighting,
+        points: Points,
+        basis: str = "direction",
+        strata: int = 2,
+        seed: int = 0,
+    ) -> None:
+        self.scene, self.lighting, self.points = scene, lighting, points
+        self.basis, self.seed = basis, seed
+        self.strata = strata if basis == "texel" else 1
+        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
+
+    @property
+    def rays_per_element(self) -> int:
+        """Shadow rays that one element above the horizon costs."""
+        return self.strata**2
+
+    @property
+    def block_size(self) -> int:
+        """Rows whose rays fill one wavefront."""
+        return max(1, LANES // (self._padded * self.rays_per_element))
+
+    def row_storage(self, n: int) -> NDArray[np.uint32] | NDArray[np.uint16]:
+        """Zeros for n rows in the stored form of the basis: (n, ceil(n_directions / 32)) or (n, n_directions)."""
+        if self.basis == "direction":
+            return np.zeros((n, self._padded // BITS), dtype=np.uint32)
+        return np.zeros((n, self._n_texels), dtype=np.uint16)
+
+    def rows(self, point_ids: NDArray[np.integer]) -> NDArray[np.uint32] | NDArray[np.uint16]:
+        """Trace whole rows and return them in stored form (see ``row_storage``)."""
+        # one id more than rows: Dr.Jit would compile another kernel for an array of size one
+        n, ids = len(point_ids), mi.UInt32(np.append(point_ids, point_ids[-1:]))
+        if self.basis == "direction":
+            lane = dr.arange(mi.UInt32, n * self._padded)
+            row = lane // self._padded
+            texel = lane - row * self._padded
+            point = dr.gather(mi.UInt32, ids, row)
+            visible, _ = self.trace(point, self._texels.centre(texel), texel < self._n_texels)
+            bits = dr.select(visible, mi.UInt32(1) << (texel & (BITS - 1)), 0)
+            return dr.block_reduce(dr.ReduceOp.Or, bits, BITS).numpy().reshape(n, -1)
+        element, stratum = self._lanes(n * self._n_texels)
+        row = element // self._n_texels
+        texel = element - row * self._n_texels
+        mean = self._mean_cosine(dr.gather(mi.UInt32, ids, row), texel, stratum, self.seed)
+        return mi.UInt32(mean * FIXED_POINT + 0.5).numpy().astype(np.uint16).reshape(n, -1)
+
+    def elements(
+        self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
+    ) -> NDArray[np.float32]:
+        """White direct transport (the T of albedo 1) of listed elements.
+
+        Parameters
+        ----------
+        point_ids, texel_ids : (n,) integers
+        seed : int, optional
+            Texel basis: another seed gives an independent estimate.
+
+        Returns
+        -------
+        (n,) float32
+            ``V max(0, n.w) d_omega / pi``, or the mean of ``V max(0, n.w)`` over the texel times ``d_omega / pi``.
+        """
+        cosine = np.zeros(len(point_ids), dtype=np.float32)
+        size = LANES // self.rays_per_element
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            if self.basis == "direction":
+                visible, cos = self.trace(points, self._texels.centre(texels), mi.Mask(True))
+                cosine[part] = dr.select(visible, cos, 0).numpy()
+            else:
+                element, stratum = self._lanes(len(texels))
+                point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+                cosine[part] = self._mean_cosine(
+                    point, texel, stratum, self.seed if seed is None else seed
+                ).numpy()
+        return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
+
+    def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Whether points see the centres of texels, (n,) bool; never below the horizon. One ray per element."""
+        seen = np.zeros(len(point_ids), dtype=bool)
+        for a in range(0, len(point_ids), LANES):
+            part = slice(a, a + LANES)
+            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            seen[part] = self.trace(points, self._texels.centre(texels), mi.Mask(True))[0].numpy()
+        return seen
+
+    def _lanes(self, n_elements: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Element and stratum of every lane, strata of an element side by side."""
+        lane = dr.arange(mi.UInt32, n_elements * self.rays_per_element)
+        element = lane // self.rays_per_element
+        return element, lane - element * self.rays_per_element
+
+    @property
+    def _n_texels(self) -> int:
+        return self.lighting.n_directions
+
+    @property
+    def _padded(self) -> int:
+        """Directions rounded up to whole words of bits."""
+        return -(-self._n_texels // BITS) * BITS
+
+    def trace(self, point: mi.UInt32, direction: mi.Vector3f, active: mi.Mask) -> tuple[mi.Mask, mi.Float]:
+        """Which points see the sky in a direction (unit, world), and the cosine; lanes side by side.
+
+        Below the horizon no ray is traced and nothing is seen.
+        """
+        cosine = dr.dot(self._points.normal(point), direction)
+        active &= cosine > 0
+        ray = start_ray(self._points, point, direction)
+        return active & ~self.scene.ray_test(ray, active=active), cosine
+
+    def _mean_cosine(self, point: mi.UInt32, texel: mi.UInt32, stratum: mi.UInt32, seed: int) -> mi.Float:
+        """Mean of V max(0, n.w) over each texel, lanes being its strata; one value per element.
+
+        Weights are the solid angles of the samples over their sum, so that the mean never leaves [0, 1].
+        """
+        rng = random_generator(self._points.key(point), texel, stratum, seed)
+        row = stratum // self.strata
+        u = (mi.Float(stratum - row * self.strata) + rng.next_float32()) / self.strata
+        v = (mi.Float(row) + rng.next_float32()) / self.strata
+        direction, weight = self._texels.inside(texel, u, v)
+        visible, cosine = self.trace(point, direction, mi.Mask(True))
+        seen = dr.select(visible, cosine * weight, 0)
+        total = dr.block_reduce(dr.ReduceOp.Add, weight, self.rays_per_element)
+        return dr.block_reduce(dr.ReduceOp.Add, seen, self.rays_per_element) / total

@@ -1,0 +1,229 @@
+"""The first bounce G rho D as a product of thin matrices, from some combinations of its columns and from some rows.
+
+One basis serves the columns of all channels: these see the same light by the same rays. It is spanned by random
+combinations of columns (Halko, Martinsson and Tropp 2011), of few columns each, as D is dear to expand. Coefficients
+of all columns then follow by least squares from some rows, which G and D give at the cost of their rays:
+G rho D ~ Q (Q_S)^+ (G rho D)_S. Rows are drawn in proportion to their leverage, the squared norm of their row of Q; the
+squared error is then 1 + r / (s - r) times the least, s rows and rank r (Drineas, Mahoney and Muthukrishnan 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.sparse_product import gathered, product
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.direct_columns import DirectColumns
+from mi_sparse_prt.operators.operator import Part
+
+DRAWS = 3  # of up to 32 combinations of columns each, that join the basis together
+MIXED = 24  # columns in a combination
+SUMS = 1 << 13  # of rows; a power of two
+PROJECTIONS = 24  # that tell leverage within 30%
+ROWS = 4  # times the rank
+FEW_ROWS = 1024  # of which all are taken
+BASES = 0.75  # of the squared tolerance: the last of the energy takes a random basis many vectors
+MOST = 1024  # vectors in a basis, about: time grows as their square, and what is left is mostly noise
+PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FirstBounce:
+    """A matrix per channel, ``left @ right``.
+
+    Attributes
+    ----------
+    left : tuple of (n, rank) float32
+        Columns that are nearly orthonormal.
+    right : tuple of (rank, n_directions) float32
+        Orthogonal rows, the longest first.
+    left_out : float
+        Estimated relative L2 error, all channels together.
+    """
+
+    left: tuple[Floats, ...]
+    right: tuple[Floats, ...]
+    left_out: float
+
+
+def first_bounce(
+    matrix: scipy.sparse.csr_array,
+    albedo: Floats,
+    direct: Part,
+    lighting: CubemapLighting,
+    keys: NDArray[np.uint64],
+    tolerance: float,
+    seed: int,
+) -> FirstBounce:
+    """G rho D for all channels.
+
+    Parameters
+    ----------
+    matrix : (n, n_v) sparse float32
+        G.
+    albedo : (channels, n_v) float32
+    direct : Part
+        D.
+    lighting : CubemapLighting
+    keys : (n,) uint64
+        Of the rows of G: random numbers are made of them.
+    tolerance : float
+        Relative L2 error; it is larger where that would take a rank far above 1000.
+    seed : int
+
+    Returns
+    -------
+    FirstBounce
+    """
+    rng = np.random.default_rng(seed)
+    hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
+    columns, turn, missed = _basis(matrix, albedo, DirectColumns(direct, lighting), hashes, rng, tolerance)
+    count = _row_count(turn.shape[1], len(keys))
+    rows, probability = _chosen_rows(_leverage(columns, turn, rng), hashes, count)
+    some = columns[rows].astype(np.float64) @ turn
+    weighted = some.T / probability
+    fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
+    right = [fit @ known for known in _rows(matrix[rows], albedo, direct, lighting)]
+    return _truncated(columns, turn, right, missed, tolerance)
+
+
+def _basis(
+    matrix: scipy.sparse.csr_array,
+    albedo: Floats,
+    light: DirectColumns,
+    hashes: NDArray[np.uint64],
+    rng: np.random.Generator,
+    tolerance: float,
+) -> tuple[Floats, Doubles, float]:
+    """Combinations Y (n, m) of the columns of all channels; turn (m, r), which makes them a basis; what that misses.
+
+    Random combinations have, on average, the energy of all columns: each block of them measures what the basis misses
+    before it joins (Halko et al. 2011, 4.3). Gram and Schmidt see random sums of rows only, by which lengths and
+    angles change little (Balabanov and Grigori 2022).
+    """
+    shorten = _sums(hashes)
+    blocks: list[Floats] = []  # [row, combination]
+    short: list[Doubles] = []  # [sum of rows, combination]
+    turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
+    while True:
+        block = _combinations(matrix, albedo, light, rng)
+        new = (block if shorten is None else product(shorten, block)).astype(np.float64)
+        products = [old.T @ new for old in (*short, new)]
+        # [vector, combination]
+        known = turn.T @ np.concatenate([np.zeros((0, new.shape[1])), *products[:-1]])
+        rest = products[-1] - known.T @ known
+        energies.append(np.trace(products[-1]))
+        energy = max(float(np.mean(energies)), 1e-30)
+        missed = max(float(np.trace(rest)), 0) / energy * _amplification(len(known), len(block), len(new))
+        squares, vectors = np.linalg.eigh(rest)
+        kept = squares > (PRECISION / 2) ** 2 * energy
+        if missed <= BASES * tolerance**2 or not kept.any() or len(known) >= MOST:
+            return np.hstack([*blocks, block[:, :0]]), turn, missed
+        steps = vectors[:, kept] / np.sqrt(squares[kept])
+        turn = np.block([[turn, -turn @ (known @ steps)], [np.zeros((len(steps), turn.shape[1])), steps]])
+        blocks.append(block)
+        short.append(new)
+
+
+def _sums(hashes: NDArray[np.uint64]) -> scipy.sparse.csr_array | None:
+    """A matrix (SUMS, n) that adds up rows at random, with signs; None where they are few enough as they are."""
+    n = len(hashes)
+    if n <= SUMS:
+        return None
+    signs = 1 - 2 * (hashes >> np.uint64(63)).astype(np.float32)
+    entries = signs, ((hashes & np.uint64(SUMS - 1)).astype(np.int64), np.arange(n))
+    return scipy.sparse.csr_array(entries, shape=(SUMS, n))
+
+
+def _combinations(
+    matrix: scipy.sparse.csr_array, albedo: Floats, light: DirectColumns, rng: np.random.Generator
+) -> Floats:
+    """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations)."""
+    found, draws = [], max(1, DRAWS // len(albedo))
+    for rho in albedo:
+        mixed = np.hstack([light.combined(MIXED, rng) for _ in range(draws)])
+        found.append(gathered(matrix, rho[None], mixed)[0])
+    return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
+
+
+def _amplification(rank: int, n: int, sums: int) -> float:
+    """Of the squared error: what least squares make worse of it, from sums of rows and from some of the rows."""
+    rows = _row_count(rank, n)
+    return (1.0 if rows == n else rows / (rows - rank)) / (1.0 if sums == n else 1 - rank / sums)
+
+
+def _row_count(rank: int, n: int) -> int:
+    count = max(FEW_ROWS, ROWS * rank)
+    return n if 2 * count > n else count
+
+
+def _leverage(columns: Floats, turn: Doubles, rng: np.random.Generator) -> Doubles:
+    """Squared norms (n,) of the rows of the basis, about: from random projections."""
+    projection = turn @ rng.standard_normal((turn.shape[1], PROJECTIONS))
+    return np.square(columns @ projection.astype(np.float32)).sum(axis=1, dtype=np.float64)
+
+
+def _chosen_rows(
+    leverage: Doubles, hashes: NDArray[np.uint64], count: int
+) -> tuple[NDArray[np.int64], Doubles]:
+    """Some rows, (count,), drawn without replacement in proportion to their leverage, and how probable each was.
+
+    A row of leverage w arrives after an exponential time of rate w. The first are taken: each with a probability of
+    1 - exp(-w t), t the time at which the next one arrives.
+    """
+    n = len(leverage)
+    if count == n:
+        return np.arange(n), np.ones(n)
+    words = mix(hashes)
+    uniform = ((words >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    rate = np.maximum(leverage, 1e-30)
+    arrival = -np.log(uniform) / rate
+    order = np.lexsort((words, arrival))
+    rows = np.sort(order[:count])
+    return rows, -np.expm1(-rate[rows] * arrival[order[count]])
+
+
+def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Part, lighting: CubemapLighting) -> Floats:
+    """G rho D (channels, s, n_directions) for some rows (s, n_v) of G, from those rows of D that they touch."""
+    touched, columns = np.unique(matrix.indices, return_inverse=True)
+    shape = matrix.shape[0], len(touched)
+    local = scipy.sparse.csr_array((matrix.data, columns.astype(np.int32), matrix.indptr), shape=shape)
+    rho = np.ascontiguousarray(albedo[:, touched])
+    result = np.empty((len(rho), shape[0], lighting.n_directions), np.float32)
+    for texels, light in DirectColumns(direct, lighting, touched).blocks(len(touched)):
+        result[:, :, texels] = gathered(local, rho, light)
+    return result
+
+
+def _truncated(
+    columns: Floats, turn: Doubles, right: list[Floats], missed: float, tolerance: float
+) -> FirstBounce:
+    """In terms of singular vectors, the least of them left out, as far as the tolerance allows."""
+    parts = [np.linalg.eigh(b.astype(np.float64) @ b.T.astype(np.float64)) for b in right]
+    squares = [np.maximum(values[::-1], 0) for values, _ in parts]
+    energy = sum(float(s.sum()) for s in squares)
+    kept = all_but_least(squares, max(tolerance**2 - missed, 0) * energy)
+    turns = [u[:, ::-1][:, k].astype(np.float32) for (_, u), k in zip(parts, kept, strict=True)]
+    dropped = sum(float(s[~k].sum()) for s, k in zip(squares, kept, strict=True))
+    return FirstBounce(
+        tuple(columns @ (turn @ u).astype(np.float32) for u in turns),
+        tuple(u.T @ b for u, b in zip(turns, right, strict=True)),
+        float(np.sqrt(missed + dropped / max(energy, 1e-30))),
+    )
+
+
+def all_but_least(energies: Sequence[NDArray[np.floating]], expendable: float) -> list[NDArray[np.bool_]]:
+    """Which to keep of each channel, the least left out that come to no more than ``expendable`` all together."""
+    every = np.sort(np.concatenate(energies))
+    few = int(np.searchsorted(np.cumsum(every), expendable, side="right"))
+    least = every[few] if few < len(every) else np.inf
+    return [x >= least for x in energies]

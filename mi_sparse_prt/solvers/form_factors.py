@@ -1,0 +1,209 @@
+"""One bounce of light between vertices as a sparse matrix, by rays ([Leh07] 2.5, T_i of eq. 18)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.scene.scene import Scene
+
+LANES = 1 << 23  # rays per wavefront
+# In place of a vertex: what a ray meets if it is not the front of a surface
+NOTHING = int(np.iinfo(np.int32).max)
+BEHIND = NOTHING - 1  # a surface that would reflect on its back as well
+FEW = 0.01  # such hits among all: inside of closed surfaces, where it is dark
+
+
+def gather_matrix(
+    scene: Scene,
+    points: Points,
+    rays_per_vertex: int,
+    seed: int = 0,
+    nodes: NDArray[np.integer] | None = None,
+) -> scipy.sparse.csr_array:
+    """G (n, n_v): what cosine-distributed rays from some vertices find, by the vertices of the triangles they hit.
+
+    Each ray names one corner of its triangle, by chance and with the barycentric weight as its probability. That is
+    linear interpolation on average, for a third of the entries. A ray that meets nothing, or a surface from behind,
+    finds no light.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+        Of all vertices.
+    rays_per_vertex : int
+        A power of two.
+    seed : int
+    nodes : (n,) integers, optional
+        The vertices that have rows; all if not given.
+
+    Returns
+    -------
+    (n, n_v) sparse float32
+        Entries are multiples of 1 / rays_per_vertex.
+    """
+    if rays_per_vertex < 1 or rays_per_vertex & (rays_per_vertex - 1):
+        raise PrtError(f"rays_per_vertex {rays_per_vertex} is not a power of two; use 64, 128, 256, ...")
+    surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
+    starting = np.arange(len(points)) if nodes is None else nodes
+    size = max(1, LANES // rays_per_vertex)
+    blocks, met, behind = [], 0, 0
+    for a in range(0, len(starting), size):
+        ids = mi.UInt32(starting[a : a + size].astype(np.uint32))
+        hits = surfaces.seen_from(arrays, ids, samples, seed)
+        met += int(np.count_nonzero(hits != NOTHING))
+        behind += int(np.count_nonzero(hits == BEHIND))
+        blocks.append(_merged(hits.reshape(-1, rays_per_vertex)))
+    surfaces.check_backs(behind, met)
+    counts, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32 if counts.sum() < NOTHING else np.int64)
+    entries = values / np.float32(rays_per_vertex), columns, starts
+    return scipy.sparse.csr_array(entries, shape=(len(starting), len(points)))
+
+
+class Surfaces:
+    """The triangles of a scene on the device, by the numbers of all vertices."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene.normalised
+        shapes = scene.normalised.shapes()
+        number = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)).numpy()[0]) for shape in shapes]
+        first = np.zeros(max(number) + 1, np.uint32)  # triangle of each shape, by its number in Dr.Jit
+        lengths = [len(mesh.triangles) for mesh in scene.meshes]
+        first[number] = np.cumsum([0, *lengths[:-1]])
+        two_sided = np.array([mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide) for shape in shapes])
+        back = np.full(len(first), NOTHING, np.uint32)  # what rays from behind find
+        back[number] = np.where(two_sided, BEHIND, NOTHING)
+        self._two_sided = [mesh.name for mesh, both in zip(scene.meshes, two_sided, strict=True) if both]
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        self._first, self._triangles = mi.UInt32(first), mi.UInt32(triangles.astype(np.uint32).ravel())
+        self._normals, self._back = mi.Vector3f(scene.normals.T), mi.UInt32(back)
+        dr.eval(self._first, self._triangles, self._normals, self._back)
+
+    def seen_from(
+        self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
+    ) -> NDArray[np.int32]:
+        """A vertex, NOTHING or BEHIND for every sample of each point; samples side by side."""
+        ray, _, u = cosine_rays(points, ids, samples, seed)
+        return mi.Int32(self.traced(ray, u)).numpy()
+
+    def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
+        """A vertex, NOTHING or BEHIND for every ray; u in [0, 1) chooses among the corners of a triangle."""
+        return self._vertex(self._scene.ray_intersect_preliminary(ray), ray.d, u)
+
+    def _vertex(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
+        """The corner of each hit triangle that u in [0, 1) selects."""
+        valid = hit.is_valid()
+        shape = dr.reinterpret_array(mi.UInt32, hit.shape)
+        first = dr.gather(mi.UInt32, self._first, shape, valid)
+        corners = [
+            dr.gather(mi.UInt32, self._triangles, 3 * (first + hit.prim_index) + k, valid) for k in range(3)
+        ]
+        b = hit.prim_uv.x, hit.prim_uv.y
+        weights = 1 - b[0] - b[1], *b
+        normal = mi.Vector3f(0)
+        for corner, weight in zip(corners, weights, strict=True):
+            normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
+        chosen = dr.select(u < b[0], corners[1], dr.select(u < b[0] + b[1], corners[2], corners[0]))
+        front = dr.dot(normal, direction) < 0  # of the shading normal, as for Mitsuba's BSDFs
+        chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._back, shape, valid))
+        return dr.select(valid, chosen, NOTHING)
+
+    def check_backs(self, behind: int, met: int) -> None:
+        """Refuse a scene in which many rays meet surfaces of two sides from behind."""
+        if behind > FEW * met:
+            names = "', '".join(self._two_sided[:3])
+            raise PrtError(
+                f"{behind / met:.0%} of the hits that vertices see are backs of two-sided surfaces ('{names}'): "
+                "light is gathered from fronts only; use path tracing instead"
+            )
+
+
+def cosine_rays(
+    points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
+) -> tuple[mi.Ray3f, mi.UInt32, mi.Float]:
+    """Cosine-distributed rays from points, samples side by side; each one's point, and a number in [0, 1) for it."""
+    rays = len(samples[0])
+    lane = dr.arange(mi.UInt32, len(ids) * rays)
+    row = lane // rays
+    point = dr.gather(mi.UInt32, ids, row)
+    rng = random_generator(points.key(point), mi.UInt32(0), mi.UInt32(0), seed)
+    # bits flipped alike for all samples of a point (Owen's digital shift): they stay stratified
+    x, y, z = (
+        mi.Float((dr.gather(mi.UInt32, column, lane - row * rays) ^ rng.next_uint32()) >> 8) * 2**-24
+        for column in samples
+    )
+    local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
+    direction = mi.Frame3f(points.normal(point)).to_world(local)
+    return start_ray(points, point, direction), point, z
+
+
+def sobol(n: int) -> list[mi.UInt32]:
+    """Three columns of n Sobol points as 32-bit fractions, neighbours on the square side by side."""
+    fractions = qmc.Sobol(3, scramble=False, bits=32).random(n)
+    points = (fractions * 2.0**32).astype(np.uint64).astype(np.uint32)
+    order = np.argsort(_interleaved(points[:, 0] >> 16, points[:, 1] >> 16), kind="stable")
+    columns = [mi.UInt32(column) for column in points[order].T.copy()]
+    dr.eval(columns)
+    return columns
+
+
+def _interleaved(x: NDArray[np.uint32], y: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """The bits of two 16-bit numbers in turn (Morton's order)."""
+    result = np.zeros_like(x)
+    for k in range(16):
+        result |= (x >> k & 1) << (2 * k) | (y >> k & 1) << (2 * k + 1)
+    return result
+
+
+@numba.njit(parallel=True, cache=True)
+def _sorted(hits: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Sort each row in place; how many different vertices it has."""
+    counts = np.empty(len(hits), np.int64)
+    for i in numba.prange(len(hits)):
+        row = np.sort(hits[i])
+        hits[i] = row
+        count = 0
+        for k in range(len(row)):
+            count += row[k] < BEHIND and (k == 0 or row[k] != row[k - 1])
+        counts[i] = count
+    return counts
+
+
+def _merged(hits: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Entries of each row (n,), their columns, in order, and how many rays they got, (m,) each."""
+    counts = _sorted(hits)
+    columns = np.empty(counts.sum(), np.int32)
+    values = np.empty(len(columns), np.float32)
+    _fill(hits, np.cumsum(counts) - counts, columns, values)
+    return counts, columns, values
+
+
+@numba.njit(parallel=True, cache=True)
+def _fill(
+    hits: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    values: NDArray[np.float32],
+) -> None:
+    for i in numba.prange(len(hits)):
+        at = starts[i] - 1
+        for k in range(hits.shape[1]):
+            vertex = hits[i, k]
+            if vertex >= BEHIND:
+                break
+            if k == 0 or vertex != hits[i, k - 1]:
+                at += 1
+                columns[at], values[at] = vertex, np.float32(1)
+            else:
+                values[at] += np.float32(1)

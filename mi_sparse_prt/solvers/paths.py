@@ -1,0 +1,260 @@
+"""S_i by path tracing: interreflected light, one independent estimate per element ([Leh07] eq. 12 with T - V apart).
+
+Every element is a small Monte Carlo problem of its own: paths start at its point, and each surface they meet is lit
+by its texel through one shadow ray. Nothing about the surfaces is assumed; they are asked through Mitsuba's BSDF
+interface. The estimates of different elements are independent, which later statistics rely on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.texel_arrays import TexelArrays
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.measurement.vertices import Points
+
+LANES = 1 << 22  # paths per wavefront, about half a second each
+ROULETTE_DEPTH = 5  # bounces before Russian roulette starts, as Mitsuba's ``path`` has it
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean of an element's samples, and the variance of that mean, each (n, channels) float32."""
+
+    mean: NDArray[np.float32]
+    variance: NDArray[np.float32]
+
+
+class PathSolver:
+    """Indirect light at points of a scene, one element per point and texel.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Normalised copy without emitters.
+    lighting : CubemapLighting
+    points : Points
+    basis : {"direction", "texel"}
+        Light from the texel's centre alone, or radiance 1 over the whole texel.
+    max_depth : int
+        As Mitsuba's ``path`` counts it for a ray that ends on the point: 3 = one interreflection, -1 = no limit.
+    spp : int
+        Paths per element.
+    channels : {1, 3}
+        1 in a grey scene: red stands for all.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        lighting: CubemapLighting,
+        points: Points,
+        basis: str = "direction",
+        max_depth: int = 5,
+        spp: int = 16,
+        channels: int = 3,
+        seed: int = 0,
+    ) -> None:
+        self.scene, self.lighting, self.points = scene, lighting, points
+        self.basis, self.max_depth, self.spp, self.channels, self.seed = basis, max_depth, spp, channels, seed
+        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
+
+    @property
+    def block_elements(self) -> int:
+        """Elements whose paths fill one wavefront."""
+        return max(1, LANES // self.spp)
+
+    @property
+    def block_size(self) -> int:
+        """Rows whose paths fill one wavefront."""
+        return max(1, self.block_elements // self.lighting.n_directions)
+
+    def any_hit(self, rays_per_point: int) -> bool:
+        """Whether any of a few cosine-distributed rays per point meets a surface; often the first ones tell."""
+        for a, b in ((0, 1), (1, rays_per_point)):
+            lane = dr.arange(mi.UInt32, len(self.points) * (b - a))
+            point = lane // (b - a)
+            sample = lane - point * (b - a) + a
+            rng = random_generator(self._points.key(point), mi.UInt32(0), sample, self.seed)
+            if dr.any(self.scene.ray_test(self._first_ray(point, rng))):
+                return True
+        return False
+
+    def rows(self, point_ids: NDArray[np.integer]) -> Estimate:
+        """Whole rows: mean and variance (len(point_ids), n_directions, channels), see ``elements``."""
+        shape = (len(point_ids), self.lighting.n_directions, self.channels)
+        points = np.repeat(np.asarray(point_ids, dtype=np.uint32), self.lighting.n_directions)
+        texels = np.tile(np.arange(self.lighting.n_directions, dtype=np.uint32), len(point_ids))
+        estimate = self.elements(points, texels)
+        return Estimate(estimate.mean.reshape(shape), estimate.variance.reshape(shape))
+
+    def elements(
+        self,
+        point_ids: NDArray[np.integer],
+        texel_ids: NDArray[np.integer],
+        seed: int | None = None,
+    ) -> Estimate:
+        """White indirect transport per solid angle (the indirect T of albedo 1, divided by d_omega) of listed elements.
+
+        Parameters
+        ----------
+        point_ids, texel_ids : (n,) integers
+            Neighbouring elements should share the point: their rays are then coherent.
+        seed : int, optional
+            Another seed than the solver's gives independent estimates.
+
+        Returns
+        -------
+        Estimate
+            ``mean`` (n, channels) in 1/sr, and the variance of that mean.
+
+        Raises
+        ------
+        PrtError
+            If a BSDF gives a value that is not finite, naming the first point and texel whose paths find it.
+        """
+        mean = np.zeros((len(point_ids), self.channels), dtype=np.float32)
+        variance = np.zeros_like(mean)
+        seed = self.seed if seed is None else seed
+        size = self.block_elements
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            block = self._estimate(mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part]), seed)
+            mean[part], variance[part] = block.mean, block.variance
+        return Estimate(mean, variance)
+
+    def _estimate(self, points: mi.UInt32, texels: mi.UInt32, seed: int) -> Estimate:
+        lane = dr.arange(mi.UInt32, len(points) * self.spp)
+        element = lane // self.spp
+        point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+        rng = random_generator(self._points.key(point), texel, lane - element * self.spp, seed)
+        ray = self._first_ray(point, rng)
+        samples = self._weighted(point, ray.d, self._radiance(ray, texel, rng))
+        powers = [x * x for x in samples]
+        dr.eval(samples, powers)  # in one kernel
+        sums, squares = (
+            [dr.block_reduce(dr.ReduceOp.Add, x, self.spp) for x in xs] for xs in (samples, powers)
+        )
+        mean = np.stack([x.numpy() for x in sums], axis=-1) / self.spp
+        second = np.stack([x.numpy() for x in squares], axis=-1) / self.spp
+        self._check_finite(np.isfinite(mean) & np.isfinite(second), points, texels)
+        variance = np.maximum(second - mean**2, 0) / max(self.spp - 1, 1)
+        return Estimate(mean.astype(np.float32), variance.astype(np.float32))
+
+    def _check_finite(self, finite: NDArray[np.bool_], points: mi.UInt32, texels: mi.UInt32) -> None:
+        """Refuse a block of elements (n, channels) of which one is not finite, naming the first."""
+        bad = np.flatnonzero(~finite.all(axis=1))
+        if not len(bad):
+            return
+        point, texel = int(points.numpy()[bad[0]]), int(texels.numpy()[bad[0]])
+        direction = np.round(self.lighting.directions[texel].astype(float), 4).tolist()
+        raise PrtError(
+            f"vertex {point} gets indirect light that is not finite from texel {texel}, direction {direction} "
+            f"({len(bad)} such elements): repair the BSDF or texture of a surface that it sees"
+        )
+
+    def _first_ray(self, point: mi.UInt32, rng: mi.PCG32) -> mi.Ray3f:
+        """Cosine-distributed about the shading normal."""
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        return start_ray(self._points, point, mi.Frame3f(self._points.normal(point)).to_world(local))
+
+    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:
+        """One sample per channel of (1/pi) times the irradiance at points, by the radiance that their first rays find.
+
+        These are cosine-distributed, which makes it the mean of that radiance, wherever they go.
+        """
+        return [radiance[c] for c in range(self.channels)]
+
+    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
+        """One sample of the radiance that first rays find on other surfaces, per d_omega."""
+        bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
+        if self.basis == "direction":
+            return _reflected(self.scene, ray, Light(self._texels.centre(texel), mi.Float(1)), rng, bounces)
+        # Radiance 1 over the texel: each path sees its own direction in it, weighted to 1 on average.
+        direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
+        mean = self._texels.solid_angle(texel)
+        light = Light(direction, solid_angle / mean)
+        if has_mirrors(self.scene):
+            light = Light(direction, solid_angle / mean, lambda d: self._texels.contains(texel, d), 1 / mean)
+        return _reflected(self.scene, ray, light, rng, bounces)
+
+
+@dataclass
+class Light:
+    """The light of one element: irradiance (perpendicular) from one direction, for all surfaces but mirrors.
+
+    A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths that
+    leave the scene right after one collect ``radiance`` if they leave towards the light (``contains``).
+    """
+
+    direction: mi.Vector3f
+    irradiance: mi.Float
+    contains: Callable[[mi.Vector3f], mi.Mask] | None = None
+    radiance: mi.Float | None = None
+
+
+def has_mirrors(scene: mi.Scene) -> bool:
+    """Whether any surface scatters into single directions."""
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes())
+
+
+@dr.syntax
+def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32) -> mi.Color3f:
+    """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
+
+    Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most.
+    """
+    context = mi.BSDFContext()
+    ray = mi.Ray3f(ray)
+    result, throughput = mi.Color3f(0), mi.Color3f(1)
+    depth = mi.UInt32(0)
+    mirrored = mi.Mask(False)
+    active = mi.Mask(depth < bounces)
+    while active:
+        si = scene.ray_intersect(ray, active)
+        if light.contains is not None:
+            escaped = active & mirrored & ~si.is_valid()
+            result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
+        active &= si.is_valid() & (depth < bounces)
+
+        # Light from its one direction
+        bsdf = si.bsdf(ray)
+        value, _, sample, weight = bsdf.eval_pdf_sample(
+            context,
+            si,
+            si.to_local(light.direction),
+            rng.next_float32(),
+            mi.Point2f(rng.next_float32(), rng.next_float32()),
+            active,
+        )
+        # NaN is lit, so that it is noticed, and what factored BSDFs make negative
+        lit = active & ~dr.all(value == 0)
+        lit &= ~scene.ray_test(si.spawn_ray(light.direction), lit)
+        result += dr.select(lit, throughput * value * light.irradiance, 0)
+
+        # Next surface
+        depth += 1
+        throughput *= weight
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
+        if light.contains is None:
+            active &= depth < bounces
+        else:  # one more ray after the last mirror, to see the light itself
+            active &= (depth < bounces) | mirrored & (depth == bounces)
+
+        # Russian roulette
+        survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(dr.abs(throughput)), 0.95), 1)
+        active &= rng.next_float32() < survival
+        throughput /= survival
+    return result

@@ -1,0 +1,329 @@
+"""S_i by finite elements: light that surfaces gather from each other ([Leh07] 2.5, eq. 18-21).
+
+Diffuse light is known at the vertices and interpolated on the triangles between. One bounce is then a sparse matrix G:
+its row i is the mean over cosine-distributed rays from vertex i of what they find at their other end. The indirect part
+of white transport is the Neumann series X = G rho D + G rho G rho D + ..., D the direct part and rho the albedo.
+
+Indirect light is smooth. Where a scene has more vertices than it needs, G has rows at some of them only, the nodes, and
+others take their light from these: X = W (G rho D + G rho W G rho D + ...). D and rho stay those of all vertices.
+
+G also blurs the shadows' edges in D: what is left has a low rank, and ``RadiositySolver.indirect`` computes few of its
+columns and rows (``first_bounce``). Later bounces are those of its singular vectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.sparse_product import gathered, product
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.operators.direct_columns import DirectColumns
+from mi_sparse_prt.operators.low_rank import LowRank
+from mi_sparse_prt.operators.operator import Part
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.first_bounce import FirstBounce, all_but_least, first_bounce
+from mi_sparse_prt.solvers.form_factors import gather_matrix
+from mi_sparse_prt.solvers.surface_nodes import Nodes
+from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
+
+COLUMNS = 256  # of a dense matrix that G is applied to at a time
+LATER = 0.25  # of the squared tolerance: what a later bounce may leave out of the light that it starts from
+NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
+LONGEST = 1024  # bounces after which light is taken not to end
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Gathered(LowRank):
+    """Indirect light, and how it was found.
+
+    Attributes
+    ----------
+    left_out : float
+        Estimated relative L2 error of the first bounce, for its low rank alone.
+    bounces : int
+        Interreflections that were added up.
+    """
+
+    left_out: float
+    bounces: int
+
+
+class FiniteElements:
+    """Interreflections between vertices, or whatever else rows of light stand for.
+
+    Parameters
+    ----------
+    matrix : (n_nodes, n) sparse float32
+        G.
+    albedo : (channels, n) float32
+    keys : (n,) uint64
+        Random numbers are made of them.
+    nodes : Nodes
+        Those that gather light, others interpolate theirs.
+    contacts : Contacts
+        Vertices whose light is in part none for the triangles around them.
+    lighting : CubemapLighting
+    max_depth : int
+        As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
+        nothing are left out.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        matrix: scipy.sparse.csr_array,
+        albedo: Floats,
+        keys: NDArray[np.uint64],
+        nodes: Nodes,
+        contacts: Contacts,
+        lighting: CubemapLighting,
+        max_depth: int,
+        seed: int,
+    ) -> None:
+        self.matrix, self._albedo, self._keys, self.nodes = matrix, albedo, keys, nodes
+        self.contacts, self.lighting, self.max_depth, self.seed = contacts, lighting, max_depth, seed
+        self.channels = len(albedo)
+
+    def apply(self, columns: Floats) -> Floats:
+        """Indirect light under a few lights, without approximation.
+
+        Parameters
+        ----------
+        columns : (n_v, k) float32
+            White direct transport of each light, without what ``contacts`` leaves out.
+
+        Returns
+        -------
+        (n_v, k, channels) float32
+            White indirect transport.
+        """
+        result = np.zeros((*columns.shape, self.channels), np.float32)
+        count = self.bounces(columns.sum(axis=1))
+        for a in range(0, columns.shape[1] if count else 0, COLUMNS):
+            part = slice(a, a + COLUMNS)
+            light = list(gathered(self.matrix, self._albedo, columns[:, part]))
+            totals = light
+            for _ in range(count - 1):
+                light = self._reflected(light)
+                totals = [total + x for total, x in zip(totals, light, strict=True)]
+            result[:, part] = np.stack([self.nodes.spread(total) for total in totals], axis=-1)
+        return result
+
+    def rows(self, direct: Part, ids: NDArray[np.integer]) -> Floats:
+        """Indirect light of a few vertices, without approximation: bounces in reverse ([Leh07] 2.6).
+
+        Parameters
+        ----------
+        direct : Part
+            The direct part of the matrix, with a row for each vertex.
+        ids : (k,) integers
+
+        Returns
+        -------
+        (k, n_directions, channels) float32
+            White indirect transport.
+        """
+        direct = self.contacts.lit(direct)
+        count = self._count_for(direct)
+        totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
+        result = np.empty((len(ids), self.lighting.n_directions, self.channels), np.float32)
+        for texels, light in DirectColumns(direct, self.lighting).blocks(len(self._albedo[0])):
+            for c, weights in enumerate(totals):
+                result[:, texels, c] = weights.T @ light
+        return result
+
+    def _adjoint(self, rho: Floats, ids: NDArray[np.integer], count: int) -> Floats:
+        """Weights (n_v, k) of all vertices' direct light in the indirect light of some."""
+        weights = np.zeros((len(rho), len(ids)), np.float32)
+        weights[ids, np.arange(len(ids))] = 1
+        total = np.zeros_like(weights)
+        for _ in range(count):
+            weights = rho[:, None] * product(self._transposed, self.nodes.collect(weights))
+            total += weights
+        return total
+
+    @cached_property
+    def _transposed(self) -> scipy.sparse.csr_array:
+        return self.matrix.T.tocsr()
+
+    def indirect(self, direct: Part, tolerance: float = 0.03) -> Gathered:
+        """Indirect light for all texels, factored.
+
+        Parameters
+        ----------
+        direct : Part
+            The direct part of the matrix, with a row for each vertex.
+        tolerance : float
+            Relative L2 error of the first bounce that a low rank may cost; later bounces are smoother and lose less.
+
+        Returns
+        -------
+        Gathered
+        """
+        direct = self.contacts.lit(direct)
+        count = self._count_for(direct)
+        if count == 0:
+            left = np.zeros((self._albedo.shape[1], 0), np.float32)
+            right = np.zeros((0, self.lighting.n_directions), np.float32)
+            return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
+        keys = self._keys[self.nodes.ids]
+        first = first_bounce(self.matrix, self._albedo, direct, self.lighting, keys, tolerance, self.seed)
+        totals = self._all_bounces(first, count, LATER * tolerance**2)
+        spread = tuple(self.nodes.spread(total) for total in totals)
+        return Gathered(spread, first.right, first.left_out, count)
+
+    def _all_bounces(self, first: FirstBounce, count: int, expendable: float) -> list[Floats]:
+        """The left factors after ``count`` bounces.
+
+        Later ones need fewer singular vectors: before each, those are left out of which all together had this share
+        of the first one's energy.
+        """
+        sizes = [np.square(right).sum(axis=1, dtype=np.float64) for right in first.right]
+        least = expendable * sum(_energies(x) @ size for x, size in zip(first.left, sizes, strict=True))
+        totals, light = [x.copy() for x in first.left], list(first.left)
+        at = [np.arange(len(size)) for size in sizes]
+        for _ in range(count - 1):
+            energies = [_energies(x) * size[i] for x, size, i in zip(light, sizes, at, strict=True)]
+            kept = all_but_least(energies, least)
+            at = [i[k] for i, k in zip(at, kept, strict=True)]
+            light = self._reflected([x[:, k] for x, k in zip(light, kept, strict=True)])
+            for total, i, x in zip(totals, at, light, strict=True):
+                total[:, i] += x
+        return totals
+
+    def _count_for(self, direct: Part) -> int:
+        return self.bounces(direct.relight(np.ones((self.lighting.n_directions, 3), np.float32))[:, 0])
+
+    def bounces(self, even: Floats) -> int:
+        """How many interreflections count for anything.
+
+        No light is negative: what a bounce adds under all lights together bounds what it adds under each.
+
+        Parameters
+        ----------
+        even : (n_v,) float32
+            Direct light for all lights together: the sums of D's rows.
+
+        Raises
+        ------
+        PrtError
+            If ``max_depth`` is -1 and light does not end, between white surfaces that let none escape.
+        """
+        total, count = 0.0, 0
+        light = list(gathered(self.matrix, self._albedo, even[:, None]))
+        while self.max_depth < 0 or count < self.max_depth - 2:
+            peak = max(float(x.max(initial=0)) for x in light)
+            if peak == 0:
+                break
+            count, total = count + 1, total + peak
+            if peak * self._reach <= NEGLIGIBLE * total:
+                break
+            if self.max_depth < 0 and np.isinf(self._reach):
+                raise PrtError(
+                    "max_depth -1: light between white surfaces does not end; give a max_depth or lower the albedo"
+                )
+            light = self._reflected(light)
+        return count
+
+    @cached_property
+    def _reach(self) -> float:
+        """Bound of G rho + (G rho)^2 + ... in the maximum norm, by the albedo and by what escapes."""
+        light = [np.ones((len(self.nodes), 1), np.float32)] * self.channels
+        total = 0.0
+        for _ in range(LONGEST):
+            light = self._reflected(light)
+            peak = max(float(x.max(initial=0)) for x in light)
+            total += peak
+            if peak <= 0.5:  # as many bounces more add at most this share of these, and so on
+                return total / (1 - peak)
+        return np.inf
+
+    def _reflected(self, light: list[Floats]) -> list[Floats]:
+        """One bounce: G rho W x for arrays x (n_nodes, any), one per channel."""
+        pairs = zip(self._albedo, light, strict=True)
+        return [gathered(self.matrix, rho[None], self.nodes.spread(x))[0] for rho, x in pairs]
+
+
+class RadiositySolver(FiniteElements):
+    """Indirect light at the vertices of a diffuse scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    lighting : CubemapLighting
+    points : Points
+        Of all vertices (``vertex_points``).
+    rays_per_vertex : int
+        A power of two: Sobol points, scrambled for each vertex by its key.
+    max_depth : int
+        As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
+        nothing are left out.
+    seed : int
+    nodes : Nodes, optional
+        The vertices that gather light, others interpolate theirs; all if not given.
+
+    Attributes
+    ----------
+    nodes : Nodes
+    contacts : Contacts
+        Vertices whose light is in part none for the triangles around them.
+    matrix : (n_nodes, n_v) sparse float32
+        G. Rows sum to the share of the hemisphere, by cosine, in which fronts of surfaces are seen.
+    channels : {1, 3}
+        1 in a grey scene.
+    rays : int
+        That were traced.
+
+    Raises
+    ------
+    PrtError
+        If a surface is not diffuse, or if vertices often see the backs of surfaces that reflect on both sides: light
+        is known at their fronts only.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        lighting: CubemapLighting,
+        points: Points,
+        rays_per_vertex: int = 256,
+        max_depth: int = 5,
+        seed: int = 0,
+        nodes: Nodes | None = None,
+    ) -> None:
+        _check_diffuse(scene)
+        nodes = nodes or Nodes(np.arange(len(points)), None)
+        super().__init__(
+            gather_matrix(scene, points, rays_per_vertex, seed, nodes.ids),
+            np.ascontiguousarray(scene.albedo.T[: 1 if scene.grey else 3]),
+            points.keys,
+            nodes,
+            contacts(scene, lighting),
+            lighting,
+            max_depth,
+            seed,
+        )
+        self.rays = len(nodes) * rays_per_vertex
+
+
+def _energies(x: Floats) -> NDArray[np.float64]:
+    """Of each column."""
+    return np.square(x).sum(axis=0, dtype=np.float64)
+
+
+def _check_diffuse(scene: Scene) -> None:
+    for material in scene.materials:
+        if not material.diffuse:
+            raise PrtError(
+                f"shape '{material.name}' is not diffuse: light is gathered from diffuse surfaces only; "
+                "use path tracing instead"
+            )
