@@ -21,9 +21,8 @@ except PrtError as _error:
 from mi_sparse_prt.compression.compress import compress  # noqa: E402
 from mi_sparse_prt.emission.cubemap import CubemapLighting  # noqa: E402
 from mi_sparse_prt.emission.environment import Environment, load_environment  # noqa: E402
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy  # noqa: E402
 from mi_sparse_prt.plugins import register as _register_plugins  # noqa: E402
-from mi_sparse_prt.precompute import precompute  # noqa: E402
+from mi_sparse_prt.precompute import precompute, precompute_glossy  # noqa: E402
 from mi_sparse_prt.relighting.image import render  # noqa: E402
 from mi_sparse_prt.scene.scene import Scene, load_scene  # noqa: E402
 from mi_sparse_prt.storage import load_transport  # noqa: E402
@@ -31,6 +30,8 @@ from mi_sparse_prt.transport import LightTransport  # noqa: E402
 from mi_sparse_prt.validation.validate import Validation, validate  # noqa: E402
 
 _register_plugins()
+
+GlossyTransport = LightTransport  # one class serves both
 
 __all__ = [
     "CubemapLighting",

@@ -5,20 +5,37 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 from mi_sparse_prt.io.cache_folder import cache_folder
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.storage import VERSION, load_transport
+from mi_sparse_prt.storage import load_transport
 from mi_sparse_prt.transport import LightTransport
+
+# whose code decides what is in a matrix
+_ROOMS = (
+    "core",
+    "scene",
+    "emission",
+    "measurement",
+    "reflection",
+    "operators",
+    "transport.py",
+    "solvers",
+    "sampling",
+    "reconstruction",
+    "methods",
+    "estimation",
+    "planner",
+    "precompute.py",
+)
 
 
 def cached_precompute(
@@ -38,57 +55,33 @@ def cached_precompute(
         Made if it does not exist; the default is ``cache_folder()``. Files in it may be deleted at any time.
     progress : bool
     **settings
-        As for ``precompute``. Together with the scene's hash they are the key of the file; the order of the scene's
-        shapes is not part of it.
+        As for ``precompute``. Together with the scene's hash and the algorithms they are the key of the file; the order
+        of the scene's shapes is not part of it.
     """
-    what = asdict(Settings(lighting.resolution, **settings))
-    found = _cached(
-        scene,
-        what,
-        folder or cache_folder(),
-        lambda kept: precompute(scene, lighting, progress=progress, checkpoint_folder=kept, **settings),
-    )
-    assert isinstance(found, LightTransport)
-    return found
-
-
-def cached_glossy(
-    scene: Scene,
-    lighting: CubemapLighting,
-    folder: Path | None = None,
-    progress: bool = True,
-    **settings: Any,
-) -> GlossyTransport:
-    """``precompute_glossy``, or the transport that an earlier call left in a folder; as ``cached_precompute``."""
-    what = {"glossy": lighting.resolution, **settings}
-    found = _cached(
-        scene,
-        what,
-        folder or cache_folder(),
-        lambda _: precompute_glossy(scene, lighting, progress=progress, **settings),
-    )
-    assert isinstance(found, GlossyTransport)
-    return found
-
-
-def _cached(
-    scene: Scene,
-    what: dict[str, Any],
-    folder: Path,
-    make: Callable[[Path], LightTransport | GlossyTransport],
-) -> LightTransport | GlossyTransport:
-    """What a scene and JSON-able settings lead to, from a file of the folder or made, given the folder, and kept."""
-    key = json.dumps([VERSION, scene.hash, what], sort_keys=True)
-    path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.prt"
+    folder = folder or cache_folder()
+    key = [_algorithms(), scene.hash, asdict(Settings(lighting.resolution, **settings))]
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()
+    path = folder / f"{digest[:32]}.prt"
     if path.exists():
         try:
             return load_transport(path, scene)
         except PrtError as error:
-            warnings.warn(f"cache: {error}", PrtWarning, stacklevel=3)
-    transport = make(folder)
+            warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
+    transport = precompute(scene, lighting, progress=progress, checkpoint_folder=folder, **settings)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         transport.save(path)
     except (OSError, PrtError) as error:  # the result is good, only not kept
-        warnings.warn(f"cache: {error}", PrtWarning, stacklevel=3)
+        warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
     return transport
+
+
+@cache
+def _algorithms() -> str:
+    """Stands for all code that a matrix depends on: one that other code would compute is not served."""
+    root = Path(__file__).parent
+    state = hashlib.sha256()
+    for room in _ROOMS:
+        for path in sorted((root / room).rglob("*.py")) if (root / room).is_dir() else [root / room]:
+            state.update(path.read_bytes())
+    return state.hexdigest()[:16]

@@ -9,13 +9,13 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.errors import PrtWarning
+from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.estimation.held_out import held_out_error
-from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.methods.brute_force import share_above_horizon
-from mi_sparse_prt.methods.execution import Evaluation, indirect_solver
+from mi_sparse_prt.methods.execution import Execution, indirect_solver
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
@@ -23,12 +23,14 @@ from mi_sparse_prt.planner.candidates import Ladder, Ranking, ladder
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import forecast
 from mi_sparse_prt.planner.pilot import measure
+from mi_sparse_prt.reflection.surfaces import vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
-_JUDGES = 1 << 20  # seeds of held-out elements that decide ...
-_DIRECT_JUDGE = _JUDGES << 1  # ... and of those that direct light alone is judged by
+_OTHER_SEEDS = 1 << 20  # of held-out elements that decide ...
+_DIRECT_SEED = _OTHER_SEEDS << 1  # ... and of those that tell how good direct light alone is
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 
 
@@ -46,6 +48,8 @@ def precompute(
     indirect_resolution: int | None = None,
     strata: int = 2,
     checkpoint_folder: str | Path | None = None,
+    terms: int = 0,
+    harmonics: int | None = None,
 ) -> LightTransport:
     """Compute the light transport matrix of a scene.
 
@@ -90,6 +94,12 @@ def precompute(
     checkpoint_folder : path, optional
         Finished rows of path-traced indirect light are kept there until the matrix is complete: the same call after
         an interruption goes on where it stopped (``"huang2010"``: with the dense rows only).
+    terms : int
+        K, in-out factors of each BRDF that is not diffuse ([HR10] eq. 2), for radiance that depends on the view; with
+        0, all surfaces are seen as diffuse. ``"auto"`` then means finite elements, with ever more rays for a target.
+    harmonics : int, optional
+        Spherical harmonics up to this order instead of each BRDF's own incident factors: (order + 1)^2 terms, which
+        serve any BRDF (``LightTransport.with_bsdf``).
 
     Returns
     -------
@@ -106,46 +116,57 @@ def precompute(
         If an argument makes no sense, or the matrix or what a method needs for it would not fit into memory.
     """
     settings = Settings(
-        lighting.resolution, method, basis, max_depth, spp, target_error, seed, indirect_resolution, strata
+        lighting.resolution,
+        method,
+        basis,
+        max_depth,
+        spp,
+        target_error,
+        seed,
+        indirect_resolution,
+        strata,
+        terms,
+        harmonics,
     )
     reset_peak_memory()
     clock = Stopwatch()
     with clock.phase("setup"):
-        points = vertex_points(scene)
-        direct = DirectSolver(scene.normalised, lighting, points, basis, strata, seed)
-    reason = _no_indirect(scene, settings, clock)
-    proposals = _proposals(scene, direct, settings, reason is None, clock)
+        reflection = vertex_reflection(scene, terms, harmonics)
+        problem = Problem(scene, lighting, reflection, basis, max_depth)
+        direct = DirectSolver(scene.normalised, lighting, problem.points, basis, strata, seed)
+    reason = _no_indirect(problem, settings, clock)
+    proposals = _proposals(problem, direct, settings, reason is None, clock)
     with clock.phase("pilot"):
-        expected = forecast(scene, direct, settings, proposals.plan, reason is None, proposals.seconds)
-    evaluation = Evaluation(scene, direct, settings, reason is None, clock, progress, checkpoint_folder)
-    tried = _tried_direct(evaluation, proposals, scene, settings, clock)
+        expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
+    evaluation = Execution(problem, direct, settings, reason is None, clock, progress, checkpoint_folder)
+    tried = _tried_direct(evaluation, proposals, problem, settings, clock)
     if tried:
-        expected = forecast(scene, direct, settings, proposals.plan, reason is None, proposals.seconds)
+        expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
     if progress:
         tqdm.write(_expectation(scene, lighting, expected))
-    parts = _attempted(evaluation, proposals, tried, scene, settings, clock)
+    parts = _attempted(evaluation, proposals, tried, problem, settings, clock)
     transport = evaluation.matrix(parts)
     with clock.phase("held_out"):
-        error = held_out_error(scene, transport, max_depth, seed)
+        error = held_out_error(problem, transport, seed)
     _warn_if_missed(error, target_error, proposals.too_long)
     transport.report.update(
-        _evaluated(parts, points, lighting, _skipped(scene, reason))
+        _evaluated(parts, problem.points, lighting, _skipped(scene, reason))
         | {"estimated_error": error, "plans": proposals.report(), "forecast": expected}
         | {"plan": proposals.plan.report()}
         | _costs(transport, clock)
-        | _inputs(scene, settings.of(proposals.plan))
+        | _inputs(problem, settings.of(proposals.plan))
     )
     return transport
 
 
-def _no_indirect(scene: Scene, settings: Settings, clock: Stopwatch) -> str | None:
+def _no_indirect(problem: Problem, settings: Settings, clock: Stopwatch) -> str | None:
     """Why there is no indirect light, or None."""
     if settings.max_depth == 2:
         return "max_depth 2 asks for direct light only"
-    if scene.diffuse and not scene.albedo.any():
+    if problem.scene.diffuse and not problem.scene.albedo.any():
         return "every surface is black"
     with clock.phase("pilot"):
-        surfaces_meet = indirect_solver(scene, settings).any_hit(_PILOT_RAYS)
+        surfaces_meet = indirect_solver(problem, settings).any_hit(_PILOT_RAYS)
     return None if surfaces_meet else "no surface sees another one"
 
 
@@ -157,36 +178,37 @@ def _skipped(scene: Scene, reason: str | None) -> list[str]:
 
 
 def _proposals(
-    scene: Scene, direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
+    problem: Problem, direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
 ) -> Ladder | Ranking:
     """The plans to try, measured and ranked where the method leaves them open."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
         settings = replace(settings, spp=None, indirect_resolution=None)
-    elif settings.method != "auto":
+    elif settings.method != "auto" or settings.view_dependent:
         return ladder(settings)
     with clock.phase("plan"):
-        costs = measure(scene, direct, settings, indirect)
+        costs = measure(problem, direct, settings, indirect)
     return Ranking(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
 
 
 def _tried_direct(
-    evaluation: Evaluation, proposals: Ladder | Ranking, scene: Scene, settings: Settings, clock: Stopwatch
+    evaluation: Execution, proposals: Ladder | Ranking, problem: Problem, settings: Settings, clock: Stopwatch
 ) -> list[MethodResult]:
     """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
     if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
         return []
     parts = evaluation.direct_light(how)
     with clock.phase("held_out"):
-        found = held_out_error(scene, evaluation.matrix(parts), 2, settings.seed + _DIRECT_JUDGE)
+        only = replace(problem, max_depth=2)
+        found = held_out_error(only, evaluation.matrix(parts), settings.seed + _DIRECT_SEED)
     proposals.judged(how, found["total"])
     return [parts]
 
 
 def _attempted(
-    evaluation: Evaluation,
+    evaluation: Execution,
     proposals: Ladder | Ranking,
     tried: list[MethodResult],
-    scene: Scene,
+    problem: Problem,
     settings: Settings,
     clock: Stopwatch,
 ) -> MethodResult:
@@ -199,8 +221,8 @@ def _attempted(
     while settings.target_error is not None:
         with clock.phase("held_out"):
             transport = evaluation.matrix(attempts[-1])
-            judge = settings.seed + _JUDGES + len(attempts) - 1
-            found = held_out_error(scene, transport, settings.max_depth, judge, settings.target_error)
+            other = settings.seed + _OTHER_SEEDS + len(attempts) - 1
+            found = held_out_error(problem, transport, other, settings.target_error)
         if found["total"] <= settings.target_error or not proposals.after(found["total"]):
             break
         if evaluation.progress:
@@ -263,12 +285,13 @@ def _costs(transport: LightTransport, clock: Stopwatch) -> dict[str, Any]:
     }
 
 
-def _inputs(scene: Scene, settings: Settings) -> dict[str, Any]:
+def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
     """What the matrix was made from, for the report."""
     return {
         "seed": settings.seed,
-        "parameters": asdict(replace(settings, indirect_resolution=settings.coarse.resolution)),
-        "scene": scene.summary,
+        "parameters": asdict(replace(settings, indirect_resolution=settings.coarse.resolution))
+        | {"terms": problem.reflection.terms},
+        "scene": problem.scene.summary,
         "versions": versions(),
     }
 
@@ -284,9 +307,62 @@ def _evaluated(
         "elements": parts.elements,
         "rays": parts.rays,
         "sampling": parts.sampling,
+        "radiosity": parts.radiosity,
         "skipped": [
             *skipped,
             *parts.skipped,
             f"direct rays below the horizon: {1 - above:.0%} of the elements",
         ],
     }
+
+
+def precompute_glossy(
+    scene: Scene,
+    lighting: CubemapLighting,
+    terms: int = 4,
+    harmonics: int | None = None,
+    direct: str = "exact",
+    max_depth: int = 5,
+    rays: int = 64,
+    tolerance: float = 0.06,
+    seed: int = 0,
+    progress: bool = True,
+) -> LightTransport:
+    """``precompute`` with in-out factors of glossy BRDFs, by one plan: visibility once for all terms, finite elements.
+
+    Parameters
+    ----------
+    scene : Scene
+        BSDFs are diffuse or can be factored (``reflection.brdf_factors``).
+    lighting : CubemapLighting
+    terms, harmonics
+        As for ``precompute``.
+    direct : {"exact", "consensus"}
+        How visibility is found, once for all terms.
+    max_depth : int
+    rays : int
+        Per vertex, that gather indirect light; a power of two.
+    tolerance : float
+        Relative L2 error that a low rank may cost the first bounce; at least as much as the rays have noise.
+    seed : int
+    progress : bool
+
+    Raises
+    ------
+    PrtError
+        If an argument makes no sense, no surface is glossy, or a BSDF cannot be factored, by name.
+    """
+    if terms < 1:
+        raise PrtError(f"terms must be at least 1, not {terms}")
+    if direct not in ("exact", "consensus"):
+        raise PrtError(f"direct {direct!r} is neither 'exact' nor 'consensus'")
+    return precompute(
+        scene,
+        lighting,
+        Plan(direct, "gather", rays, tolerance),
+        max_depth=max_depth,
+        seed=seed,
+        progress=progress,
+        terms=terms,
+        harmonics=harmonics,
+    )

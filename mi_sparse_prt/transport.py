@@ -1,92 +1,148 @@
 """The result: a factored light transport matrix T ([HR10] eq. 1), stored in incident form ([Leh07] 2.4).
 
-``T[i, j, c] = albedo[i, c] * (direct[i, j] + indirect[i, j, c])``. Both parts are *white* transport: what a vertex of
-albedo 1 would send out. Direct light needs one channel and no more than its visibility; indirect light is smooth and
-may have fewer directions; colour exists only where the scene has any.
+T = R (V + S V): operators keep unit-albedo transport, what a point of albedo 1 would send out, and the reflection makes
+radiance of it. Direct light needs one channel and no more than its visibility; indirect light is smooth and may have
+fewer directions; colour exists only where the scene has any.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.io.store import write_store
+from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators.clustered import Clustered
-from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.operators.haar_rows import HaarRows
-from mi_sparse_prt.operators.interpolated import Interpolated
-from mi_sparse_prt.operators.low_rank import LowRank
-from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.operators.operator import Rows, StoredPart
-from mi_sparse_prt.operators.upsampled import Upsampled
-from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.stored import operator_arrays
+from mi_sparse_prt.operators.sum import Sum
+from mi_sparse_prt.reflection.brdf_factors import harmonic_factors
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import LinearOperator
+
+FORMAT = "mi_sparse_prt light transport matrix"
+VERSION = 7
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class MeshRange:
-    """Name of a mesh and the slice of its vertices among all."""
+class Coefficients:
+    """What one lighting makes of a glossy scene.
 
-    name: str
-    vertices: slice
+    Attributes
+    ----------
+    white : (n, 3) float32
+        Irradiance / pi of each point.
+    terms : (n, K, 3) float32
+        B_k; zeros at points that are not glossy.
+    """
+
+    white: Floats
+    terms: Floats
 
 
 @dataclass(frozen=True)
 class LightTransport:
-    """A precomputed light transport matrix T (n_v, n_directions, 3), factored.
+    """A precomputed light transport matrix T (n, n_directions, 3), factored.
 
     Attributes
     ----------
-    lighting : CubemapLighting
+    emission : CubemapLighting
+        E: the columns.
     basis : {"direction", "texel"}
-    albedo : (n_v, 3) float32
-    areas : (n_v,) float32
-        Of the surface around each vertex, world units.
-    direct, indirect : Part or None
-        White parts; None where there is no such light. A compressed matrix has both together, as ``direct``.
-    meshes : tuple of MeshRange
-    vertex_keys : (n_v,) uint64
-        Identify rows whatever their order (``Points.keys``).
+    measurement : Measurement
+        M: the points of the rows.
+    reflection : Reflection
+        R.
+    operators : mapping of str to Operator
+        V and S, unit-albedo transport: ``"direct"`` and, where there is such light, ``"indirect"``; a compressed matrix
+        has ``"compressed"``, both together. Their sum is ``incident``.
     scene_hash : str
     report : dict
         What was done, skipped, how long it took and how good it is; JSON as it is.
     """
 
-    lighting: CubemapLighting
+    emission: CubemapLighting
     basis: str
-    albedo: NDArray[np.float32]
-    areas: NDArray[np.float32]
-    direct: Visibility | FractionalVisibility | MeanCosine | Interpolated | Clustered | HaarRows
-    indirect: Upsampled | Interpolated | LowRank | None
-    meshes: tuple[MeshRange, ...]
-    vertex_keys: NDArray[np.uint64]
+    measurement: Measurement
+    reflection: Reflection
+    operators: Mapping[str, Operator]
     scene_hash: str
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(vertices, directions, 3)."""
-        return len(self.albedo), self.lighting.n_directions, 3
+        """(points, directions, 3)."""
+        return len(self.measurement), self.emission.n_directions, 3
 
     @property
     def nbytes(self) -> int:
         """Bytes of the stored factors."""
-        return sum(part.nbytes for part in self._parts())
+        return sum(operator.nbytes for operator in self.operators.values())
 
-    def rows(self, ids: ArrayLike) -> NDArray[np.float32]:
-        """Rows of T: radiance leaving vertices under light from each texel alone.
+    @property
+    def lighting(self) -> CubemapLighting:
+        """``emission``."""
+        return self.emission
+
+    @property
+    def albedo(self) -> Floats:
+        """(n, 3) float32, of the diffuse part of each point."""
+        return self.reflection.albedo
+
+    @property
+    def direct(self) -> Operator:
+        """``operators["direct"]``; a compressed matrix has none (``incident`` is what every matrix has)."""
+        return self.operators["direct"]
+
+    @property
+    def indirect(self) -> Operator | None:
+        """``operators["indirect"]``, None where there is no such light."""
+        return self.operators.get("indirect")
+
+    @property
+    def meshes(self) -> tuple[MeshRange, ...]:
+        """``measurement.groups``."""
+        return self.measurement.groups
+
+    @property
+    def terms(self) -> int:
+        """K of its glossy points, 0 where all are diffuse."""
+        return self.reflection.terms
+
+    @cached_property
+    def incident(self) -> Operator:
+        """The sum of the operators: unit-albedo rows of all points, then terms of the glossy ones."""
+        operators = tuple(self.operators.values())
+        return operators[0] if len(operators) == 1 else Sum(operators)
+
+    @property
+    def T(self) -> TransposedTransport:
+        """The transposed operator; nothing is expanded."""
+        return TransposedTransport(self)
+
+    def rows(self, ids: ArrayLike) -> Floats:
+        """Rows of T: radiosity / pi of points under light from each texel alone; of a diffuse one its radiance.
 
         Parameters
         ----------
         ids : (k,) integers
-            Vertices.
+            Points.
 
         Returns
         -------
@@ -97,11 +153,11 @@ class LightTransport:
         PrtError
             If an index is out of range.
         """
-        chosen = _checked(ids, len(self.albedo), "vertex")
-        return self.albedo[chosen][:, None, :] * self.white_rows(chosen)
+        chosen = _checked(ids, len(self.measurement), "vertex")
+        return self.reflection.radiosity(self.incident.rows(self.reflection.rows_of(chosen)), chosen)
 
-    def columns(self, ids: ArrayLike) -> NDArray[np.float32]:
-        """Columns of T: radiance leaving all vertices under light from one texel each.
+    def columns(self, ids: ArrayLike) -> Floats:
+        """Columns of T: radiosity / pi of all points under light from one texel each.
 
         Parameters
         ----------
@@ -110,34 +166,72 @@ class LightTransport:
 
         Returns
         -------
-        (n_v, k, 3) float32
+        (n, k, 3) float32
 
         Raises
         ------
         PrtError
             If an index is out of range.
         """
-        chosen = _checked(ids, self.lighting.n_directions, "direction")
-        return self.albedo[:, None, :] * _summed([part.columns(chosen) for part in self._parts()])
+        chosen = _checked(ids, self.emission.n_directions, "direction")
+        return self.reflection.radiosity(self.incident.columns(chosen))
 
-    def irradiance(self, lighting: Any) -> NDArray[np.float32]:
-        """What leaves the vertices if they were white: irradiance / pi, (n_v, 3) float32 (see ``relight``)."""
-        radiance = self.lighting.project(lighting)
-        return _summed([part.relight(radiance) for part in self._parts()])
+    def irradiance(self, lighting: Any) -> Floats:
+        """What leaves the points if they were white: irradiance / pi, (n, 3) float32 (see ``relight``)."""
+        return self._incident_light(lighting)[: len(self.measurement)]
 
-    def relight(self, lighting: Environment | ArrayLike) -> NDArray[np.float32]:
-        """B = T L: radiance leaving the vertices under an environment.
+    def relight(self, lighting: Environment | ArrayLike, outgoing: ArrayLike | None = None) -> Floats:
+        """B = T L: light leaving the points under an environment.
 
         Parameters
         ----------
         lighting : Environment, str, or (n_directions, 3) float
             An environment is projected to the cubemap first.
+        outgoing : (n, 3) or (3,) float, world, optional
+            Directions in which light leaves.
 
         Returns
         -------
-        (n_v, 3) float32
+        (n, 3) float32
+            Radiance towards ``outgoing``; without it radiosity / pi, which is the radiance of a diffuse point.
         """
-        return self.albedo * self.irradiance(lighting)
+        incident = self._incident_light(lighting)
+        if outgoing is None or not isinstance(self.reflection, InOutFactors):
+            return self.reflection.radiosity(incident)
+        towards = np.broadcast_to(np.asarray(outgoing, np.float32), self.reflection.normals.shape)
+        towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        return self.reflection.radiance(incident, towards)
+
+    def coefficients(self, lighting: Environment | ArrayLike) -> Coefficients:
+        """Irradiance / pi and terms of all points under an environment or L (n_directions, 3)."""
+        n, found = len(self.measurement), self._incident_light(lighting)
+        terms = np.zeros((n, self.terms, 3), np.float32)
+        terms[self.reflection.glossy] = found[n:].reshape(-1, self.terms, 3)
+        return Coefficients(found[:n], terms)
+
+    def _incident_light(self, lighting: Any) -> Floats:
+        """Of all rows, (rows, 3)."""
+        return self.incident.relight(self.emission.project(lighting))
+
+    def apply(self, x: Floats) -> Floats:
+        """Products T x: (n_directions, 3, k) to (n, 3, k), radiosity / pi; each channel has its own vectors."""
+        incident = np.moveaxis(self.incident.apply(x), 1, 2)  # [row, k, channel]
+        return np.ascontiguousarray(np.moveaxis(self.reflection.radiosity(incident), 2, 1))
+
+    def adjoint(self, y: Floats) -> Floats:
+        """Products of the transpose: (n, 3, k) to (n_directions, 3, k)."""
+        return self.incident.adjoint(self.reflection.radiosity_adjoint(np.asarray(y, np.float32)))
+
+    def as_linear_operator(self, channel: int | None = None) -> LinearOperator:
+        """T for SciPy's iterative methods.
+
+        Parameters
+        ----------
+        channel : {0, 1, 2}, optional
+            (n, n_directions) of one channel. Without it all three, block-diagonal (3 n, 3 n_directions): vectors are
+            those of red, of green and of blue, one after the other.
+        """
+        return _linear_operator(self.apply, self.adjoint, self.shape[:2], channel)
 
     def for_scene(self, scene: Scene) -> LightTransport:
         """The same matrix with its rows in the order of a scene's vertices.
@@ -152,38 +246,140 @@ class LightTransport:
         PrtError
             If the matrix belongs to another scene.
         """
-        source = row_order(self.scene_hash, self.vertex_keys, scene)
+        source = row_order(self.scene_hash, self.measurement.keys, scene)
         if source is None:
             return self
+        rows = self.reflection.rows_of(source)
+        groups = tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes)
         return replace(
             self,
-            albedo=self.albedo[source],
-            areas=self.areas[source],
-            direct=self.direct.reordered(source),
-            indirect=self.indirect and self.indirect.reordered(source),
-            meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-            vertex_keys=self.vertex_keys[source],
+            measurement=self.measurement.take(source, groups),
+            reflection=self.reflection.take(source),
+            operators={name: operator.take(rows) for name, operator in self.operators.items()},
         )
 
+    def with_bsdf(self, mesh: str, bsdf: mi.BSDF) -> LightTransport:
+        """The transport with another BSDF on a glossy mesh; nothing is traced.
+
+        Parameters
+        ----------
+        mesh : str
+            Its name.
+        bsdf : mi.BSDF
+
+        Returns
+        -------
+        LightTransport
+            Of the same points; rendered with the same scene. Light that this mesh sends to others remains that of the
+            old BSDF, all that leaves it towards a camera is of the new one.
+
+        Raises
+        ------
+        PrtError
+            If the transport was not made with ``harmonics``, whose terms serve any BSDF, if there is no such glossy
+            mesh, or if the BSDF cannot be factored or its diffuse part varies over the surface.
+        """
+        order, reflection = self.report.get("parameters", {}).get("harmonics"), self.reflection
+        if order is None or not isinstance(reflection, InOutFactors):
+            raise PrtError(
+                "these terms are of their own BRDFs; precompute them with harmonics=3 to choose later"
+            )
+        known = {m.name: m.vertices for m in self.meshes if reflection.material[m.vertices.start] >= 0}
+        if mesh not in known:
+            raise PrtError(f"{mesh!r} is no glossy mesh of this transport; it has: {', '.join(known)}")
+        factors = harmonic_factors(bsdf, mesh, order)
+        if factors.varying_diffuse:
+            raise PrtError(f"shape '{mesh}': the new BSDF has a texture; give one that is the same all over")
+        material, albedo = reflection.material.copy(), reflection.albedo.copy()
+        material[known[mesh]], albedo[known[mesh]] = len(reflection.factors), factors.diffuse
+        new = replace(reflection, material=material, albedo=albedo, factors=(*reflection.factors, factors))
+        return replace(self, reflection=new)
+
     def save(self, path: str | Path) -> None:
-        """Write the matrix to one file (see ``storage.save``)."""
-        from mi_sparse_prt.storage import save
+        """Write the matrix to one file, by convention ``*.prt``; nothing is left under the name if that fails.
 
-        save(self, path)
+        Raises
+        ------
+        PrtError
+            If the folder does not exist or the file cannot be written (full disk, permissions).
+        """
+        attributes: dict[str, Any] = {
+            "format": FORMAT,
+            "version": VERSION,
+            "emission": {"kind": "cubemap", "resolution": self.emission.resolution},
+            "basis": self.basis,
+            "measurement": self.measurement.attributes(),
+            "reflection": {"kind": self.reflection.kind, **self.reflection.attributes()},
+            "scene_hash": self.scene_hash,
+            "report": self.report,
+        }
+        arrays = {f"measurement.{name}": array for name, array in self.measurement.arrays().items()}
+        arrays |= {f"reflection.{name}": array for name, array in self.reflection.arrays().items()}
+        kinds = dict[str, str]()
+        for name, operator in self.operators.items():
+            own_kinds, own = operator_arrays(operator, name)
+            kinds, arrays = kinds | own_kinds, arrays | own
+        write_store(path, attributes | {"operators": kinds}, arrays)
 
-    def white_rows(self, ids: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Rows (k, n_directions, channels) without the albedo; a grey scene has one channel."""
-        return _summed([part.rows(ids) for part in self._parts()])
 
-    def project_white(self, vectors: NDArray[np.float32], ids: NDArray[np.integer]) -> NDArray[np.float32]:
-        """White rows of some vertices times vectors (n_directions, k): (n, k, channels)."""
-        return _summed([part.reordered(ids).project(vectors) for part in self._parts()])
+@dataclass(frozen=True)
+class TransposedTransport:
+    """T transposed: from importance at points to directions ([Leh07] 2.6).
 
-    def _parts(self) -> list[StoredPart]:
-        return [self.direct] if self.indirect is None else [self.direct, self.indirect]
+    Attributes
+    ----------
+    T : LightTransport
+        Its transpose.
+    """
+
+    T: LightTransport
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(directions, points, 3)."""
+        n, m, channels = self.T.shape
+        return m, n, channels
+
+    def apply(self, y: Floats) -> Floats:
+        """(n, 3, k) to (n_directions, 3, k)."""
+        return self.T.adjoint(y)
+
+    def adjoint(self, x: Floats) -> Floats:
+        """(n_directions, 3, k) to (n, 3, k)."""
+        return self.T.apply(x)
+
+    def as_linear_operator(self, channel: int | None = None) -> LinearOperator:
+        """As that of ``LightTransport``, transposed."""
+        return _linear_operator(self.apply, self.adjoint, self.shape[:2], channel)
 
 
-def row_order(scene_hash: str, vertex_keys: NDArray[np.uint64], scene: Scene) -> NDArray[np.int64] | None:
+def _linear_operator(apply: Any, adjoint: Any, shape: tuple[int, int], channel: int | None) -> LinearOperator:
+    """SciPy's operator of products with (columns, 3, k) and (rows, 3, k)."""
+    from scipy.sparse.linalg import LinearOperator
+
+    if channel not in (None, 0, 1, 2):
+        raise PrtError(f"channel {channel} is none of 0, 1, 2 (red, green, blue); leave it out for all three")
+    own = slice(0, 3) if channel is None else slice(channel, channel + 1)
+    blocks = own.stop - own.start
+
+    def product(function: Any, length: int, x: NDArray[np.floating]) -> Floats:
+        vectors = np.zeros((length, 3, x.size // (blocks * length)), np.float32)
+        vectors[:, own] = np.moveaxis(x.reshape(blocks, length, -1), 0, 1)
+        found = function(vectors)[:, own]
+        return np.moveaxis(found, 1, 0).reshape(blocks * len(found), -1)
+
+    n, m = shape
+    return LinearOperator(
+        (blocks * n, blocks * m),
+        matvec=lambda x: product(apply, m, x)[:, 0],
+        rmatvec=lambda y: product(adjoint, n, y)[:, 0],
+        matmat=lambda x: product(apply, m, x),
+        rmatmat=lambda y: product(adjoint, n, y),
+        dtype=np.float32,
+    )
+
+
+def row_order(scene_hash: str, keys: NDArray[np.uint64], scene: Scene) -> NDArray[np.int64] | None:
     """Where a matrix has the vertices of a scene, (n_v,); None if they come in the same order.
 
     Raises
@@ -196,18 +392,18 @@ def row_order(scene_hash: str, vertex_keys: NDArray[np.uint64], scene: Scene) ->
             f"this matrix belongs to another scene than {scene.path or 'the one given'} "
             "(geometry or materials differ); precompute it again"
         )
-    keys = vertex_points(scene).keys
-    if np.array_equal(vertex_keys, keys):
+    wanted = vertex_points(scene).keys
+    if np.array_equal(keys, wanted):
         return None
-    ours, theirs = (np.argsort(k, kind="stable") for k in (vertex_keys, keys))
-    if not np.array_equal(vertex_keys[ours], keys[theirs]):
+    ours, theirs = (np.argsort(k, kind="stable") for k in (keys, wanted))
+    if not np.array_equal(keys[ours], wanted[theirs]):
         raise PrtError("this matrix belongs to other vertices of the same scene; precompute it again")
     source = np.empty_like(ours)
     source[theirs] = ours
     return source
 
 
-def _checked(ids: ArrayLike, count: int, what: str) -> Rows:
+def _checked(ids: ArrayLike, count: int, what: str) -> NDArray[np.int64]:
     """Ids as indices below ``count``; a mask of that length and negative ids mean what they do in NumPy."""
     chosen = np.atleast_1d(np.asarray(ids))
     if chosen.dtype == bool and chosen.shape == (count,):
@@ -221,12 +417,3 @@ def _checked(ids: ArrayLike, count: int, what: str) -> Rows:
     if outside.any():
         raise PrtError(f"{what} id {chosen[outside][0]} is out of range: there are {count}")
     return np.where(chosen < 0, chosen + count, chosen)
-
-
-def _summed(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The sum; arrays of one channel stand for three. They are new, and one of them is reused."""
-    if len(parts) == 1:
-        return parts[0]
-    larger, smaller = parts if parts[0].shape[-1] >= parts[1].shape[-1] else parts[::-1]
-    larger += smaller
-    return larger

@@ -13,13 +13,13 @@ from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
 from mi_sparse_prt.benchmark.cpca_pictures import cluster_picture, relit_pictures
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.compression.clustered_pca import SphereRows, clustered_mesh, mesh_rows
-from mi_sparse_prt.compression.compress import AnyTransport, compress, default_clusters
+from mi_sparse_prt.compression.compress import compress, default_clusters
 from mi_sparse_prt.compression.cpca import Clusters, squared_distances, standard_cpca
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.glossy import precompute_glossy
-from mi_sparse_prt.precompute import precompute
+from mi_sparse_prt.precompute import precompute, precompute_glossy
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 BASES = 24
 # as in [HR10] Figure 8, by the scene's file name and the mesh; others by their number of vertices
@@ -62,7 +62,7 @@ def measure_cpca(
     return _both_ways(scene, glossy, progress, figures)
 
 
-def _both_ways(scene: Scene, transport: AnyTransport, progress: bool, figures: Path | None) -> Report:
+def _both_ways(scene: Scene, transport: LightTransport, progress: bool, figures: Path | None) -> Report:
     counts = CLUSTERS.get(Path(scene.path or "").stem) or default_clusters(transport)
     compressed = compress(transport, clusters=counts, bases=BASES, progress=progress)  # all is compiled then
     compressed = compress(transport, clusters=counts, bases=BASES, progress=progress)
@@ -108,7 +108,7 @@ def _error(rows: NDArray[np.float32], weights: NDArray[np.float32], found: Clust
 
 
 def _image_error(
-    scene: Scene, transport: AnyTransport, compressed: AnyTransport, figures: Path | None
+    scene: Scene, transport: LightTransport, compressed: LightTransport, figures: Path | None
 ) -> float | None:
     environment = scene.mitsuba.environment()
     if environment is None or not scene.mitsuba.sensors():

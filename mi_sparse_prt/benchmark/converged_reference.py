@@ -20,7 +20,7 @@ from mi_sparse_prt.benchmark.estimates import (
 )
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators.single_elements import AnyPart, elements
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
@@ -245,9 +245,9 @@ class Reference:
         self, name: str, transport: LightTransport, direct: DirectError
     ) -> tuple[MeanSquare, MeanSquare]:
         """Squared errors of the matrix of a mesh, and of its indirect part alone."""
-        indirect = self._at_elements(transport.indirect, name)
+        indirect = self._at_elements(transport.operators.get("indirect"), name)
         x, y = (indirect - half for half in self._halves[name])
-        wrong = self._at_elements(transport.direct, name) - self._exact(name)
+        wrong = self._at_elements(transport.operators["direct"], name) - self._exact(name)
         total = mean_square(direct.mean_square(name), np.broadcast_to(wrong, x.shape), x, y)
         return total, self._square_of(indirect, self._halves[name])
 
@@ -281,12 +281,12 @@ class Reference:
         inside = next(mesh.vertices for mesh in self.scene.meshes if mesh.name == name)
         return int(inside.stop - inside.start)
 
-    def _at_elements(self, part: AnyPart | None, name: str) -> NDArray[np.float64]:
+    def _at_elements(self, part: Operator | None, name: str) -> NDArray[np.float64]:
         """What a part of a matrix sends out at the elements of a mesh, (k, t, channels); 0 where there is none."""
         ids, texels = self.vertices[name], self.texels[name]
         if part is None:
             return np.zeros((*texels.shape, 1))
-        white = elements(part, np.repeat(ids, texels.shape[1]), texels.ravel())
+        white = part.elements(np.repeat(ids, texels.shape[1]), texels.ravel())
         return self._reflected(ids, white.reshape(*texels.shape, -1))
 
     def _exact(self, name: str) -> NDArray[np.float64]:
@@ -310,9 +310,7 @@ class Reference:
         """95th percentile and maximum of the relative L2 of whole rows."""
         ids, (x, y) = self._rows[name], self._row_halves[name]
         exact = self._reflected(ids, self.direct.rows(ids))
-        ours = self._reflected(ids, transport.direct.rows(ids))
-        if transport.indirect is not None:
-            ours = ours + self._reflected(ids, transport.indirect.rows(ids))
+        ours = sum(self._reflected(ids, operator.rows(ids)) for operator in transport.operators.values())
         squares = ((ours - exact - x) * (ours - exact - y)).sum(axis=(1, 2))
         relative = row_errors(squares, ((exact + x) * (exact + y)).sum(axis=(1, 2)))
         found = worst(relative, 0, "vertex")

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene.scene import Scene
@@ -16,12 +15,13 @@ from mi_sparse_prt.transport import LightTransport
 Floats = NDArray[np.float32]
 
 
-def cluster_picture(scene: Scene, compressed: LightTransport | GlossyTransport, spp: int = 64) -> Figure:
+def cluster_picture(scene: Scene, compressed: LightTransport, spp: int = 64) -> Figure:
     """The camera's view of the scene, each cluster of vertices in a colour of its own."""
-    assert isinstance(compressed.direct, Clustered)
-    colours = np.random.default_rng(1).random((len(compressed.direct.means), 3)).astype(np.float32)
+    clustered = compressed.operators["compressed"]
+    assert isinstance(clustered, Clustered)
+    colours = np.random.default_rng(1).random((len(clustered.means), 3)).astype(np.float32)
     colours = 0.15 + 0.85 * colours / colours.max(axis=1, keepdims=True)
-    shown = colours[compressed.direct.labels[: scene.n_vertices]]  # terms have their vertex' cluster
+    shown = colours[clustered.labels[: scene.n_vertices]]  # terms have their vertex' cluster
     relit = RelitScene(scene, shown / np.maximum(scene.albedo, 1e-3), None)  # colours, not reflectance
     image = np.array(mi.render(scene.mitsuba, integrator=RelitIntegrator(relit), spp=spp))[..., :3]
     return side_by_side([image], [f"{len(colours)} clusters"])

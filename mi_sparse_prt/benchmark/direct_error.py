@@ -94,7 +94,7 @@ def direct_error(exact: Visibility, transport: LightTransport) -> DirectError:
         for a in range(inside.start, inside.stop, BLOCK):
             ids = np.arange(a, min(a + BLOCK, inside.stop))
             truth = exact.rows(ids)[..., 0]
-            square = squared_albedo[ids] * (transport.direct.rows(ids)[..., 0] - truth) ** 2
+            square = squared_albedo[ids] * (transport.operators["direct"].rows(ids)[..., 0] - truth) ** 2
             norm = squared_albedo[ids] * truth**2
             rows[ids], norms[ids] = square.sum(axis=1, dtype=np.float64), norm.sum(axis=1, dtype=np.float64)
             columns[name] += square.sum(axis=0, dtype=np.float64)

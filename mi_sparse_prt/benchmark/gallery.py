@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
 from mi_sparse_prt.benchmark.cpca_pictures import cluster_picture, side_by_side
 from mi_sparse_prt.benchmark.factor_pictures import factor_picture
-from mi_sparse_prt.compression.compress import AnyTransport, compress
+from mi_sparse_prt.compression.compress import compress
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.glossy import TERMS, GlossyTransport, precompute_glossy
-from mi_sparse_prt.precompute import precompute
+from mi_sparse_prt.precompute import precompute, precompute_glossy
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.glossy_images import lit_scene
 
 SPP, REFERENCE_SPP = 64, 256
@@ -52,9 +52,10 @@ def draw_gallery(scene: Scene, lighting: CubemapLighting, progress: bool = True)
         )
     if scene.diffuse:
         return _drawn(scene, precompute(scene, lighting, max_depth=MAX_DEPTH, progress=progress), progress)
-    glossy = precompute_glossy(scene, lighting, TERMS, max_depth=MAX_DEPTH, progress=progress)
+    glossy = precompute_glossy(scene, lighting, max_depth=MAX_DEPTH, progress=progress)
     return _drawn(scene, glossy, progress) | {
-        f"factors_{k}": factor_picture(factors) for k, factors in enumerate(glossy.factors)
+        f"factors_{k}": factor_picture(factors)
+        for k, factors in enumerate(getattr(glossy.reflection, "factors", ()))
     }
 
 
@@ -67,7 +68,7 @@ def save_gallery(figures: dict[str, Figure], folder: Path, name: str) -> list[Pa
     return paths
 
 
-def _drawn(scene: Scene, transport: AnyTransport, progress: bool) -> dict[str, Figure]:
+def _drawn(scene: Scene, transport: LightTransport, progress: bool) -> dict[str, Figure]:
     light = transport.lighting.project(scene.mitsuba.environment())
     compressed = compress(transport, progress=progress)
     ours, small = (render(scene, t, light, spp=SPP, progress=progress) for t in (transport, compressed))
@@ -75,7 +76,7 @@ def _drawn(scene: Scene, transport: AnyTransport, progress: bool) -> dict[str, F
     path = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
     sensor = scene.mitsuba.sensors()[0]
     truth = np.array(mi.render(lit, sensor=sensor, integrator=path, spp=REFERENCE_SPP))[..., :3]
-    kind = f"{transport.terms} terms" if isinstance(transport, GlossyTransport) else "matrix"
+    kind = f"{transport.terms} terms" if transport.terms else "matrix"
     titles = [
         "Mitsuba path",
         f"relit, {kind}",

@@ -13,21 +13,23 @@ from mi_sparse_prt.benchmark.factor_pictures import factor_picture
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
-from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
-from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.reflection.brdf_factors import factor_error
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.materials import kind
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
+from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
 
 SPP = 16  # of brute force
 ROWS = 64  # vertices that brute force is timed at
 IMAGE_SPP, IMAGE_WIDTH = 512, 320
 STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
+TERMS = 4
 REPEATS = 2  # of which the second counts: all is compiled then
 EVALUATION = (
     "setup",
@@ -62,16 +64,14 @@ def measure_glossy(
         from some vertices, whose paths are shared by all terms; ``ratios`` of these. ``factors``: held-out errors of
         each BRDF. ``images``: what ``validate_glossy`` reports, under the scene's environment and another.
     """
-    plan = Plan("exact", "gather", rays=RAYS, tolerance=TOLERANCE)
+    plan = Plan("exact", "gather", rays=64, tolerance=0.06)
     dull = diffuse_copy(scene)
     for _ in range(REPEATS):
         diffuse = precompute(dull, lighting, method=plan, progress=progress).report["seconds"]
-        start = time.perf_counter()
-        transport = precompute_glossy(scene, lighting, progress=progress)
-        elapsed = time.perf_counter() - start
+        transport = precompute(scene, lighting, method=plan, terms=TERMS, progress=progress)
     brute = _brute_force(scene, transport) + transport.report["seconds"]["direct"]
     seconds = {
-        "glossy": elapsed,
+        "glossy": sum(transport.report["seconds"].get(name, 0.0) for name in EVALUATION),
         "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
         "brute_force": brute,
     }
@@ -80,7 +80,7 @@ def measure_glossy(
     )
     if figures is not None:
         images.save(figures)
-        for number, factors in enumerate(transport.factors):
+        for number, factors in enumerate(_factors(transport).factors):
             factor_picture(factors).savefig(figures / f"factors_{number}.png", dpi=110, bbox_inches="tight")
     return {
         **report_header(scene, lighting),
@@ -91,7 +91,7 @@ def measure_glossy(
             "glossy_over_diffuse": seconds["glossy"] / seconds["diffuse"],
             "brute_force_over_glossy": seconds["brute_force"] / seconds["glossy"],
         },
-        "ranks": transport.report["ranks"],
+        "ranks": transport.report["radiosity"]["ranks"],
         "factors": _factor_errors(scene, transport),
         "images": images.report,
     }
@@ -117,12 +117,11 @@ def diffuse_copy(scene: Scene) -> Scene:
     return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=False), float("inf"))
 
 
-def _brute_force(scene: Scene, transport: GlossyTransport) -> float:
+def _brute_force(scene: Scene, transport: LightTransport) -> float:
     """Seconds of paths for all elements, white light and all terms at once."""
-    points = vertex_points(scene)
-    max_depth = transport.report["parameters"]["max_depth"]
-    assert isinstance(transport.direct, FactoredVisibility)
-    paths = TermPaths(scene.normalised, transport.direct, points, max_depth, SPP)
+    points, max_depth = vertex_points(scene), transport.report["parameters"]["max_depth"]
+    problem = Problem(scene, transport.emission, transport.reflection, max_depth=max_depth)
+    paths = TermPaths(problem, SPP)
     every = transport.lighting.n_directions
     chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]
     for some in np.split(chosen, [ROWS]):  # the second half counts
@@ -132,10 +131,15 @@ def _brute_force(scene: Scene, transport: GlossyTransport) -> float:
     return elapsed / ROWS * len(points)
 
 
-def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
+def _factors(transport: LightTransport) -> InOutFactors:
+    assert isinstance(transport.reflection, InOutFactors)
+    return transport.reflection
+
+
+def _factor_errors(scene: Scene, transport: LightTransport) -> list[Report]:
     found = []
-    for number, factors in enumerate(transport.factors):
-        vertex = int(np.flatnonzero(transport.material == number)[0])
+    for number, factors in enumerate(_factors(transport).factors):
+        vertex = int(np.flatnonzero(_factors(transport).material == number)[0])
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.methods.execution import matrix_of
+from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.transport import LightTransport
 
 INDIRECT_RESOLUTION = 8
 
@@ -67,14 +71,6 @@ def measure_relighting(
 def _transport(
     scene: Scene, lighting: CubemapLighting, bits: NDArray[np.uint32], indirect: Upsampled | None
 ) -> LightTransport:
-    return LightTransport(
-        lighting=lighting,
-        basis="direction",
-        albedo=scene.albedo,
-        areas=scene.vertex_areas,
-        direct=Visibility(bits, scene.normals, lighting),
-        indirect=indirect,
-        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-        vertex_keys=scene.vertex_keys,
-        scene_hash=scene.hash,
-    )
+    direct = Visibility(bits, scene.normals, lighting)
+    result = MethodResult(direct, indirect, 0, {}, {})
+    return matrix_of(Problem(scene, lighting, Diffuse(scene.albedo)), result)

@@ -239,10 +239,11 @@ class RelitReference:
     def _errors_of(self, transport: LightTransport) -> dict[str, _Relit]:
         """Error of the radiance under all lights, per mesh."""
         albedo = self.scene.albedo.astype(np.float64)
-        direct = np.stack([transport.direct.relight(light) for light in self.lights]) * albedo
+        first, later = transport.operators["direct"], transport.operators.get("indirect")
+        direct = np.stack([first.relight(light) for light in self.lights]) * albedo
         indirect = np.zeros(direct.shape)
-        if transport.indirect is not None:
-            indirect = np.stack([transport.indirect.relight(light) for light in self.lights]) * albedo
+        if later is not None:
+            indirect = np.stack([later.relight(light) for light in self.lights]) * albedo
         found = {}
         for mesh in self.scene.meshes:
             relit, inside = self._relit[mesh.name], mesh.vertices

@@ -41,7 +41,7 @@ from mi_sparse_prt.core.variant import VARIANTS
 from mi_sparse_prt.validation.glossy_images import GlossyValidation, validate_glossy
 from mi_sparse_prt.validation.validate import Validation
 
-AnyTransport = prt.LightTransport | prt.GlossyTransport
+AnyTransport = prt.LightTransport
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -368,7 +368,7 @@ def relight(
                 transport = prt.load_transport(matrix)
                 loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
             report["environment"] = light.report
-            if vertices is not None and isinstance(transport, prt.GlossyTransport):
+            if vertices is not None and transport.terms:
                 raise PrtError(
                     f"{matrix} has glossy surfaces, whose light depends on the view: give -o instead"
                 )
@@ -433,7 +433,7 @@ def validate(
         loaded, transport = _scene_of(transport, matrix, scene, _definitions(define))
         result: Validation | GlossyValidation
         with command.prompt_interrupts():
-            if isinstance(transport, prt.GlossyTransport):
+            if transport.terms:
                 result = validate_glossy(loaded, transport, spp=image_spp, seed=seed, progress=not quiet)
             else:
                 result = prt.validate(
@@ -450,7 +450,7 @@ def validate(
         if output is not None:
             result.save(output)
             command.written.append(output)
-        table = glossy_images_table if isinstance(transport, prt.GlossyTransport) else validation_table
+        table = glossy_images_table if transport.terms else validation_table
         command.show(table(result.report, f"{matrix} against Mitsuba"))
 
 
@@ -635,7 +635,7 @@ def pictures(
 
 
 def _tables(transport: AnyTransport, file: Path, explain: bool = False) -> list[Table]:
-    if isinstance(transport, prt.GlossyTransport):
+    if transport.terms:
         return glossy_matrix_tables(transport, file)
     return [*(plan_tables(transport) if explain else []), *matrix_tables(transport, file)]
 

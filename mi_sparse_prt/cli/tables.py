@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.table import Table
 
-from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.glossy_images import CAUSES
@@ -376,11 +375,11 @@ def glossy_images_table(report: dict[str, Any], title: str) -> Table:
     return images
 
 
-def glossy_matrix_tables(transport: GlossyTransport, path: Path) -> list[Table]:
+def glossy_matrix_tables(transport: LightTransport, path: Path) -> list[Table]:
     """What was done, how long it took and how large it is."""
     report, (n, directions) = transport.report, (len(transport.albedo), transport.lighting.n_directions)
     done = _table(f"{path}: {n} vertices x {directions} directions, view-dependent", "", "")
-    done.add_row("glossy vertices", f"{report['glossy_vertices']:,}")
+    done.add_row("glossy vertices", f"{len(transport.reflection.glossy):,}")
     for name, count in report["rays"].items():
         done.add_row({"direct": "shadow rays"}.get(name, f"{name} rays"), f"{count:,}")
     done.add_row("matrix in memory", _bytes(transport.nbytes))

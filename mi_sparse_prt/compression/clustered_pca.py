@@ -1,7 +1,7 @@
 """Clustered PCA of a light transport matrix, of its factors: the matrix itself is never formed ([HR10] 6).
 
-Rows of white transport t_j are taken as functions on the sphere: t_j / sqrt(d_omega_j) has their L2 norm, as T has the
-solid angle in it. Rows weigh by their vertices' area.
+Rows of unit-albedo transport t_j are taken as functions on the sphere: t_j / sqrt(d_omega_j) has their L2 norm, as T
+has the solid angle in it. Rows weigh by their vertices' area.
 
 What makes it quick: inner products of rows are those of their coordinates in the space that a sample of rows spans, a
 few hundred numbers in place of thousands; for T = A D + S these are A times those of D, plus those of S. A fifth of the
@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Event
-from typing import Protocol
 
 import numba
 import numpy as np
@@ -29,9 +28,8 @@ from mi_sparse_prt.compression.cpca import (
 )
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.threads import overlapped
-from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.measurement.measurement import MeshRange
+from mi_sparse_prt.transport import LightTransport
 
 COORDINATES = 192  # at most
 SAMPLE = 1024  # rows that span their space
@@ -43,19 +41,6 @@ FITTED = 4096  # rows of a cluster that its basis is made of, at most
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-
-class Rows(Protocol):
-    """White transport by rows; ``LightTransport`` and ``GlossyTransport`` have it."""
-
-    @property
-    def lighting(self) -> CubemapLighting: ...
-
-    def white_rows(self, ids: NDArray[np.integer]) -> Floats:
-        """(k, n_directions, channels)."""
-
-    def project_white(self, vectors: Floats, ids: NDArray[np.integer]) -> Floats:
-        """Some rows times vectors (n_directions, r): (k, r, channels)."""
 
 
 @dataclass(frozen=True)
@@ -80,17 +65,17 @@ class Items:
 
 
 class SphereRows:
-    """White transport of some vertices, rows scaled to the L2 norm on the sphere.
+    """Unit-albedo transport of some vertices, rows scaled to the L2 norm on the sphere.
 
     Parameters
     ----------
-    transport : Rows
+    transport : LightTransport
     items : Items
     """
 
-    def __init__(self, transport: Rows, items: Items) -> None:
-        self._transport, self.items = transport, items
-        self.scale = np.sqrt(transport.lighting.solid_angles).astype(np.float32)
+    def __init__(self, transport: LightTransport, items: Items) -> None:
+        self._incident, self.items = transport.incident, items
+        self.scale = np.sqrt(transport.emission.solid_angles).astype(np.float32)
         self._inverse = np.float32(1) / self.scale
         self.weights = items.areas if items.areas.any() else np.ones_like(items.areas)
         self._order = np.argsort(mix(items.keys), kind="stable")
@@ -108,7 +93,7 @@ class SphereRows:
         per_item = self.items.rows.shape[1]
         for a in range(0, len(ids), EXPANDED):
             some = ids[a : a + EXPANDED]
-            white = self._transport.white_rows(self.items.rows[some].ravel())  # [row, direction, channel]
+            white = self._incident.rows(self.items.rows[some].ravel())  # [row, direction, channel]
             by_channel = np.moveaxis(white, 2, 1).reshape(len(some), per_item, -1, len(self.scale))
             into = result[a : a + EXPANDED].reshape(by_channel.shape)
             np.multiply(by_channel, self._inverse, out=into)
@@ -126,26 +111,21 @@ class SphereRows:
     def coordinates(self, span: Floats) -> Floats:
         """Of all vertices, (n, r * channels, q) for q vectors."""
         vectors: Floats = span.T * self._inverse[:, None]
-        found = self._transport.project_white(vectors, self.items.rows.ravel())  # [row, vector, channel]
-        found = np.ascontiguousarray(np.moveaxis(found, 2, 1))
+        found = self._incident.take(self.items.rows.ravel()).apply(vectors)  # [row, channel, vector]
         return found.reshape(len(self), self.items.shades.shape[1], len(span))
 
 
-def mesh_rows(transport: LightTransport | GlossyTransport, mesh: MeshRange) -> SphereRows:
+def mesh_rows(transport: LightTransport, mesh: MeshRange) -> SphereRows:
     """The rows of one mesh; a glossy vertex has those of its terms, too.
 
     Terms count in T as their outgoing factors do on average over views, which are orthogonal to each other.
     """
-    own = mesh.vertices
-    rows, shades = np.arange(own.start, own.stop)[:, None], np.square(transport.albedo[own])[:, None]
-    if isinstance(transport, GlossyTransport):
-        numbers, factors = transport.term_numbers(own)
-        rows = np.concatenate([rows, numbers], axis=1)
-        shades = np.concatenate([shades, np.broadcast_to(factors, (len(rows), *factors.shape))], axis=1)
-    if transport.white_rows(rows[:1, 0]).shape[2] == 1:  # it stands for three
+    own, measurement = mesh.vertices, transport.measurement
+    rows, shades = transport.reflection.squares(own)
+    if transport.incident.shape[2] == 1:  # it stands for three
         shades = shades.sum(axis=2, keepdims=True)
     shades = shades.reshape(len(rows), -1).astype(np.float32)
-    return SphereRows(transport, Items(rows, transport.areas[own], shades, transport.vertex_keys[own]))
+    return SphereRows(transport, Items(rows, measurement.areas[own], shades, measurement.keys[own]))
 
 
 @dataclass(frozen=True)

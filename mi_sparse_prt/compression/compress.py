@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,7 @@ from mi_sparse_prt.compression.clustered_pca import MeshClusters, clustered_mesh
 from mi_sparse_prt.compression.haar_truncation import TARGET, haar_part
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.operators.clustered import Clustered
-from mi_sparse_prt.operators.haar_rows import HaarRows
 from mi_sparse_prt.transport import LightTransport
 
 PER_CLUSTER = 300  # vertices, by default ...
@@ -25,23 +22,21 @@ ROWS = 1024  # of both matrices, expanded at a time
 NEARLY = 1.1  # times the target: predicted errors up to this are looked at
 ATTEMPTS = 5  # of which each has twice the clusters of the last
 
-AnyTransport = TypeVar("AnyTransport", LightTransport, GlossyTransport)
-
 
 def compress(
-    transport: AnyTransport,
+    transport: LightTransport,
     method: str = "cpca",
     clusters: int | dict[str, int] | None = None,
     bases: int = 24,
     target_error: float | None = None,
     seed: int = 0,
     progress: bool = True,
-) -> AnyTransport:
+) -> LightTransport:
     """Compress a light transport matrix for relighting.
 
     Parameters
     ----------
-    transport : LightTransport or GlossyTransport
+    transport : LightTransport
         Rows of a glossy vertex, white light and terms, share its cluster ([Leh07] 3.3).
     method : {"cpca", "haar"}
         Clustered principal components, per mesh ([SHHS03], [HR10] 6), or the largest Haar wavelet coefficients of each
@@ -59,10 +54,10 @@ def compress(
 
     Returns
     -------
-    LightTransport or GlossyTransport
-        Whose one part, white transport of direct and indirect light together, is compressed. ``report`` is the given
-        matrix's with ``compression``: ``method``, ``clusters`` per mesh, ``bases``, ``error`` (relative L2, per mesh
-        and ``total``, of T and ``on_sphere``: weighted by vertex area, solid angles divided out), ``nbytes``,
+    LightTransport
+        Whose one operator, unit-albedo transport of direct and indirect light together, is compressed. ``report`` is
+        the given matrix's with ``compression``: ``method``, ``clusters`` per mesh, ``bases``, ``error`` (relative L2,
+        per mesh and ``total``, of T and ``on_sphere``: weighted by vertex area, solid angles divided out), ``nbytes``,
         ``ratio`` to float32 of the same channels, ``seconds``. "haar" has ``coefficients`` and ``kept_energy`` per mesh
         in place of clusters and bases (``truncation.haar_part``).
 
@@ -73,11 +68,11 @@ def compress(
     """
     _check(transport, method, clusters, bases, target_error)
     clock = Stopwatch()
-    if method == "haar" and isinstance(transport, LightTransport):
+    if method == "haar":
         with clock.phase("haar"):
             wavelets, report = haar_part(transport, target_error or TARGET, progress)
         report = transport.report | {"compression": {"method": method, **report, "seconds": clock.report()}}
-        return replace(transport, direct=wavelets, indirect=None, report=report)
+        return replace(transport, operators={"compressed": wavelets}, report=report)
     counts = _counts(transport, clusters)
     for attempt in range(ATTEMPTS):
         with clock.phase("cpca"):
@@ -90,7 +85,7 @@ def compress(
         with clock.phase("fewer_bases"):
             found, errors = _with_fewer_bases(transport, found, target_error)
     part = _joined(transport, found)
-    compressed = replace(transport, direct=part, indirect=None, report=dict(transport.report))
+    compressed = replace(transport, operators={"compressed": part}, report=dict(transport.report))
     compressed.report["compression"] = {
         "method": method,
         "clusters": {mesh.name: len(part.means) for mesh, part in zip(transport.meshes, found, strict=True)},
@@ -104,7 +99,7 @@ def compress(
 
 
 def _check(
-    transport: LightTransport | GlossyTransport,
+    transport: LightTransport,
     method: str,
     clusters: int | dict[str, int] | None,
     bases: int,
@@ -112,9 +107,9 @@ def _check(
 ) -> None:
     if method not in METHODS:
         raise PrtError(f"method {method!r} is none of: {', '.join(METHODS)}")
-    if isinstance(transport.direct, Clustered | HaarRows):
+    if "compressed" in transport.operators:
         raise PrtError("this matrix is compressed already; give the one that it was made of")
-    if method == "haar" and isinstance(transport, GlossyTransport):
+    if method == "haar" and transport.terms:
         raise PrtError("method 'haar' is for matrices of diffuse surfaces; compress this one by 'cpca'")
     if method == "haar" and clusters is not None:
         raise PrtError("clusters are of method 'cpca'; leave them out, or the method")
@@ -130,22 +125,24 @@ def _check(
         raise PrtError(f"target_error must be between 0 and 1, not {target_error}")
 
 
-def default_clusters(transport: AnyTransport) -> dict[str, int]:
+def default_clusters(transport: LightTransport) -> dict[str, int]:
     """Clusters of each mesh, by its number of vertices."""
     sizes = {mesh.name: mesh.vertices.stop - mesh.vertices.start for mesh in transport.meshes}
     return {name: min(MOST_CLUSTERS, max(1, round(n / PER_CLUSTER))) for name, n in sizes.items()}
 
 
-def _counts(transport: AnyTransport, clusters: int | dict[str, int] | None) -> dict[str, int]:
+def _counts(transport: LightTransport, clusters: int | dict[str, int] | None) -> dict[str, int]:
     counts = default_clusters(transport)
     given = clusters if isinstance(clusters, dict) else dict.fromkeys(counts, clusters)
     return counts | {name: count for name, count in given.items() if count is not None}
 
 
 def _clustered(
-    transport: AnyTransport, counts: dict[str, int], bases: int, seed: int, progress: bool
+    transport: LightTransport, counts: dict[str, int], bases: int, seed: int, progress: bool
 ) -> list[MeshClusters]:
-    with tqdm(total=len(transport.albedo), desc="compress", unit=" vertices", disable=not progress) as bar:
+    with tqdm(
+        total=len(transport.measurement), desc="compress", unit=" vertices", disable=not progress
+    ) as bar:
         found = []
         for mesh in transport.meshes:
             found.append(clustered_mesh(mesh_rows(transport, mesh), counts[mesh.name], bases, seed=seed))
@@ -153,7 +150,7 @@ def _clustered(
     return found
 
 
-def _errors(transport: AnyTransport, sums: list[tuple[float, float]]) -> dict[str, float]:
+def _errors(transport: LightTransport, sums: list[tuple[float, float]]) -> dict[str, float]:
     """Relative L2 of each mesh and ``total``, from squared errors and squared norms."""
     errors = {mesh.name: _root(*pair) for mesh, pair in zip(transport.meshes, sums, strict=True)}
     return errors | {"total": _root(*np.sum(sums, axis=0))}
@@ -164,7 +161,7 @@ def _root(squares: float, norms: float) -> float:
 
 
 def _with_fewer_bases(
-    transport: AnyTransport, found: list[MeshClusters], target: float
+    transport: LightTransport, found: list[MeshClusters], target: float
 ) -> tuple[list[MeshClusters], dict[str, float]]:
     """As few basis vectors as meet the target; what is left out on the sphere tells how many, then T does."""
     norms = sum(mesh.norms for mesh in found)
@@ -173,13 +170,15 @@ def _with_fewer_bases(
         if predicted > (NEARLY * target) ** 2 * norms:
             continue
         fewer = [mesh.first(count) for mesh in found]
-        errors = matrix_errors(transport, replace(transport, direct=_joined(transport, fewer), indirect=None))
+        errors = matrix_errors(
+            transport, replace(transport, operators={"compressed": _joined(transport, fewer)})
+        )
         if errors["total"] <= target:
             return fewer, errors
     return found, _errors(transport, [(mesh.squares, mesh.norms) for mesh in found])
 
 
-def matrix_errors(exact: AnyTransport, other: AnyTransport) -> dict[str, float]:
+def matrix_errors(exact: LightTransport, other: LightTransport) -> dict[str, float]:
     """Relative L2 of one matrix against another of the same vertices, per mesh and ``total``."""
     sums = []
     for mesh in exact.meshes:
@@ -194,7 +193,7 @@ def matrix_errors(exact: AnyTransport, other: AnyTransport) -> dict[str, float]:
     return _errors(exact, sums)
 
 
-def _joined(transport: AnyTransport, found: list[MeshClusters]) -> Clustered:
+def _joined(transport: LightTransport, found: list[MeshClusters]) -> Clustered:
     """One part of all meshes."""
     rows = [mesh_rows(transport, mesh).items.rows for mesh in transport.meshes]
     firsts = np.cumsum([0, *(len(mesh.means) for mesh in found)])
@@ -213,7 +212,7 @@ def _joined(transport: AnyTransport, found: list[MeshClusters]) -> Clustered:
         coefficients,
         np.concatenate([mesh.means for mesh in found]),
         np.concatenate([_padded(mesh.bases, 1, widest) for mesh in found]),
-        transport.lighting,
+        transport.emission,
     )
 
 

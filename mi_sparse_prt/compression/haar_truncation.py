@@ -17,8 +17,9 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.compression.clustered_pca import mesh_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar
+from mi_sparse_prt.measurement.measurement import MeshRange
 from mi_sparse_prt.operators.haar_rows import HaarRows
-from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.transport import LightTransport
 
 TARGET = 0.05  # relative error of a row, if not given
 BLOCK = 1 << 22  # elements of the matrix, expanded at a time: about 100 MB with all copies
@@ -76,7 +77,7 @@ def haar_part(
     Returns
     -------
     HaarRows
-        White transport, direct and indirect light together.
+        Unit-albedo transport, direct and indirect light together.
     dict
         ``target_error``; ``coefficients`` of a row, per mesh: their ``mean`` and ``largest`` number; ``kept_energy``
         per mesh, a share of the squares on the sphere; ``error`` (relative L2, per mesh and ``total``, of T and
@@ -87,10 +88,12 @@ def haar_part(
     -----
     Time O(n_v n_directions).
     """
-    with tqdm(total=len(transport.albedo), desc="compress", unit=" vertices", disable=not progress) as bar:
+    with tqdm(
+        total=len(transport.measurement), desc="compress", unit=" vertices", disable=not progress
+    ) as bar:
         found = [haar_mesh(transport, mesh, target_error, bar) for mesh in transport.meshes]
     part = _joined([mesh.part for mesh in found])
-    elements = part.scales.size * transport.lighting.n_directions
+    elements = part.scales.size * transport.emission.n_directions
     names = [mesh.name for mesh in transport.meshes]
     lengths = [np.diff(mesh.part.starts) for mesh in found]
     report = {
@@ -113,7 +116,7 @@ def haar_part(
 
 def haar_mesh(transport: LightTransport, mesh: MeshRange, target_error: float, bar: tqdm) -> HaarMesh:
     """Truncate the rows of one mesh; the bar is told of vertices that are done."""
-    sphere, m = mesh_rows(transport, mesh), transport.lighting.n_directions
+    sphere, m = mesh_rows(transport, mesh), transport.emission.n_directions
     step = max(1, BLOCK // (3 * m))
     share = max(target_error**2 - ROUNDING, 0)
     blocks, sums = [], np.zeros(5)
@@ -122,7 +125,7 @@ def haar_mesh(transport: LightTransport, mesh: MeshRange, target_error: float, b
         rows = sphere.rows(ids)  # [vertex, channel, direction]
         coefficients = haar(rows)
         energies = truncate(coefficients, share)
-        part = _stored(coefficients, transport.lighting)
+        part = _stored(coefficients, transport.emission)
         blocks.append(part)
         sums += _sums(rows, part, energies, sphere.weights[ids], transport.albedo[mesh.vertices][ids])
         bar.update(len(ids))

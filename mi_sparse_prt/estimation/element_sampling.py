@@ -15,9 +15,6 @@ from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.operators.single_elements import elements
-from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.transport import LightTransport
 
 RAYS = 0.002  # of the elements of a mesh, for direct light ...
@@ -80,16 +77,16 @@ def for_direct_light(
     effort : float
         Of the usual number of elements.
     """
-    lighting, part = transport.lighting, transport.direct
+    lighting, direct = transport.emission, transport.operators["direct"]
     rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
     floor, edges = 0.0, _NO_EDGES
-    if not isinstance(part, Visibility):
+    if not direct.dark_below_horizon:
         rays, floor = rays / FEW, BELOW_HORIZON
-    if isinstance(part, Visibility | FractionalVisibility):
+    if direct.edges is not None:
         rays /= NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES
         nearest = min(AROUND + 1, lighting.n_directions)
         around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
-        edges = part.bits[inside], around.astype(np.int32)
+        edges = direct.edges[inside], around.astype(np.int32)
     return _by_cosine(lighting, normals[inside], inside.start, rays, floor, edges, rng)
 
 
@@ -119,13 +116,13 @@ def for_indirect_light(
     effort : float
         Of the usual number of elements.
     """
-    assert transport.indirect is not None
+    indirect = transport.operators["indirect"]
     total = (inside.stop - inside.start) * transport.lighting.n_directions
     count = paths_of(total, len(transport.meshes), effort)
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start
-    light = np.abs(transport.albedo[vertices] * elements(transport.indirect, vertices, texels)).sum(axis=1)
+    light = np.abs(transport.albedo[vertices] * indirect.elements(vertices, texels)).sum(axis=1)
     mean = float(light.mean(dtype=np.float64))
     density = EVEN + (1 - EVEN) * (light / mean if mean > 0 else np.ones(len(pool)))
     probability = np.minimum(1.0, count / len(pool) * density.astype(np.float64))

@@ -19,12 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.estimation.element_sampling import Chosen, for_direct_light, for_indirect_light
-from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators.single_elements import AnyPart, elements
-from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.term_paths import TermPaths, TermRays
 from mi_sparse_prt.transport import LightTransport
+
+Doubles = NDArray[np.float64]
 
 SPP = 512
 STRATA = 4  # shadow rays per axis of a texel
@@ -40,8 +43,9 @@ class Sample:
     ----------
     weights : (m,) float64
         How many elements each stands for.
-    squares, norms : (m,) float64
-        Unbiased estimates of what each adds to the squared error and the squared norm, summed over channels.
+    squares, norms : (m, 1 + R) float64
+        Unbiased estimates of what each adds to the squared error and the squared norm, summed over channels: of
+        radiance, then of each of the R incident rows of a point.
     """
 
     weights: NDArray[np.float64]
@@ -53,36 +57,36 @@ Samples = dict[tuple[str, str], Sample]  # by the names of a mesh and of a part
 
 
 def held_out_error(
-    scene: Scene, transport: LightTransport, max_depth: int, seed: int, target: float | None = None
+    problem: Problem, transport: LightTransport, seed: int, target: float | None = None
 ) -> dict[str, Any]:
     """Estimate the relative L2 error of a matrix.
 
     Parameters
     ----------
-    scene : Scene
+    problem : Problem
+        Where the matrix has no indirect light, none is expected.
     transport : LightTransport
-        Of this scene, rows in the order of its vertices; its albedo is the scene's.
-    max_depth : int
-        As for ``precompute``. Where the matrix has no indirect light, none is expected.
+        Rows in the order of the scene's vertices.
     seed : int
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     target : float, optional
-        Relative L2 error. If given, elements are drawn by the quarter until these leave no doubt (2 standard errors)
-        whether the error is above it.
+        Relative L2 error. If given, elements are drawn by the quarter until it is clear (2 standard errors) whether the
+        error is above it.
 
     Returns
     -------
     dict
-        ``total`` (relative L2), ``meshes`` (name -> relative L2), ``standard_error`` (``total`` and ``meshes`` again,
-        from the spread between elements; where no element is wrong, as if an average one were), ``elements`` (how
-        many were drawn).
+        ``total`` (relative L2 of radiance, squares averaged over views by their cosine), ``meshes`` (name -> relative
+        L2), ``standard_error`` (``total`` and ``meshes`` again, from the spread between elements; where no element is
+        wrong, as if an average one were), ``elements`` (how many were drawn), and of glossy scenes ``terms``: relative
+        L2 of each term's rows.
     """
-    judge, rng = _Judge(scene, transport, max_depth, seed), np.random.default_rng([seed, 1])
+    estimator, rng = _Estimator(problem, transport, seed), np.random.default_rng([seed, 1])
     if target is None:
-        return _estimate(judge.samples(rng, 1.0))
+        return _estimate(estimator.samples(rng, 1.0))
     samples: Samples = {}
     for _ in range(round(1 / ROUND)):
-        samples = _together(samples, judge.samples(rng, ROUND))
+        samples = _together(samples, estimator.samples(rng, ROUND))
         found = _estimate(samples)
         if abs(found["total"] - target) > 2 * found["standard_error"]["total"]:
             break
@@ -112,98 +116,156 @@ def _estimate(samples: Samples) -> dict[str, Any]:
             "meshes": {name: error for name, (_, error) in meshes.items()},
         },
         "elements": sum(len(sample.weights) for sample in samples.values()),
-    }
+    } | _term_errors(list(samples.values()))
 
 
-class _Judge:
+def _term_errors(samples: list[Sample]) -> dict[str, list[float]]:
+    """``terms``, where any sample has them."""
+    rows = max(sample.squares.shape[1] for sample in samples)
+    if rows <= 2:
+        return {}
+    glossy = [sample for sample in samples if sample.squares.shape[1] == rows]
+    return {"terms": [relative(glossy, row)[0] for row in range(2, rows)]}
+
+
+class _Estimator:
     """Compares elements of a matrix with true ones."""
 
-    def __init__(self, scene: Scene, transport: LightTransport, max_depth: int, seed: int) -> None:
-        self._transport, self._albedo = transport, scene.albedo.astype(np.float64)
-        self._normals = scene.normals
-        points, lighting = vertex_points(scene), transport.lighting
-        self._seeds = [(seed << 3) + k for k in (2, 3, 4)]  # none is the matrix's own
-        self._rays = DirectSolver(scene.normalised, lighting, points, transport.basis, STRATA, self._seeds[0])
-        self._paths = PathSolver(
-            scene.normalised,
-            lighting,
-            points,
-            transport.basis,
-            max_depth,
-            SPP,
-            1 if scene.grey else 3,
-            self._seeds[2],
-        )
+    def __init__(self, problem: Problem, transport: LightTransport, seed: int) -> None:
+        self._problem, self._transport = problem, transport
+        self._direct, self._indirect = transport.operators["direct"], transport.operators.get("indirect")
+        self._seeds = [(seed << 3) + k for k in (2, 3, 4, 5)]  # none is the matrix's own
+        scene, reflection = problem.scene, problem.reflection
+        shared = scene.normalised, problem.emission, problem.points, problem.basis
+        self._rays = DirectSolver(*shared, STRATA, self._seeds[0])
+        if isinstance(reflection, InOutFactors):
+            self._term_rays = TermRays(self._rays, reflection)
+            self._paths: PathSolver = TermPaths(problem, SPP // 2, self._seeds[2])
+        else:
+            self._paths = PathSolver(*shared, problem.max_depth, SPP, problem.channels, self._seeds[2])
 
     def samples(self, rng: np.random.Generator, effort: float) -> Samples:
         """Elements of each mesh, for direct and for indirect light."""
-        transport, samples = self._transport, {}
-        for mesh in transport.meshes:
-            lit = for_direct_light(transport, self._normals, mesh.vertices, rng, effort)
+        samples, normals = {}, self._problem.points.normals
+        for mesh in self._transport.meshes:
+            lit = for_direct_light(self._transport, normals, mesh.vertices, rng, effort)
             samples[mesh.name, "direct"] = self.direct(lit)
-            if transport.indirect is not None:
-                seen = for_indirect_light(transport, mesh.vertices, rng, effort)
+            if self._indirect is not None:
+                seen = for_indirect_light(self._transport, mesh.vertices, rng, effort)
                 samples[mesh.name, "indirect"] = self.indirect(seen)
         return samples
 
     def direct(self, chosen: Chosen) -> Sample:
         """Squared errors and norms of direct light alone."""
         x, y = self._halves(chosen)
-        ours = self._ours(self._transport.direct, chosen)[:, 0]
-        squared_albedo = (self._albedo[chosen.vertices] ** 2).sum(axis=1)
-        return Sample(chosen.weights, squared_albedo * (ours - x) * (ours - y), squared_albedo * x * y)
+        ours = self._ours(self._direct, chosen)
+        return self._sample(chosen, (ours - x, ours - y), (x, y))
 
     def indirect(self, chosen: Chosen) -> Sample:
         """What indirect light adds to both: its square and twice its product with direct light."""
-        transport = self._transport
-        assert transport.indirect is not None
+        assert self._indirect is not None
+        first, second, variance = self._true_indirect(chosen)
+        direct = np.mean(self._halves(chosen), axis=0)
+        ours, direct_error = self._ours(self._indirect, chosen), self._ours(self._direct, chosen) - direct
+        errors = ours - first, ours - second + 2 * direct_error
+        return self._sample(chosen, errors, (first, second + 2 * direct), variance)
+
+    def _true_indirect(self, chosen: Chosen) -> tuple[Doubles, Doubles, Doubles]:
+        """Indirect light (m, rows, channels) twice, and what the product of the two has of variance.
+
+        Rows of a glossy point have noise in common, since paths are: two halves of the paths tell them apart. The mean
+        of all and its variance are nearer to the truth where there is one row.
+        """
+        solid_angles = self._problem.emission.solid_angles[chosen.texels].astype(np.float64)[:, None, None]
+        rows, shape = self._rows_per_point(chosen), (len(chosen.vertices), -1, self._problem.channels)
+
+        def true(estimate: NDArray[np.float32], power: Doubles) -> Doubles:
+            return estimate.reshape(shape)[:, :rows] * power
+
         estimate = self._paths.elements(chosen.vertices, chosen.texels)
-        solid_angles = transport.lighting.solid_angles[chosen.texels].astype(np.float64)[:, None]
-        true = estimate.mean * solid_angles  # [element, channel]
-        variance = estimate.variance * solid_angles**2
-        direct = np.mean(self._halves(chosen), axis=0)[:, None]
-        error = self._ours(transport.indirect, chosen) - true
-        direct_error = self._ours(transport.direct, chosen) - direct
-        squared_albedo = self._albedo[chosen.vertices] ** 2
-        squares = squared_albedo * (error * (error + 2 * direct_error) - variance)
-        norms = squared_albedo * (true * (true + 2 * direct) - variance)
-        return Sample(chosen.weights, squares.sum(axis=1), norms.sum(axis=1))
+        mean = true(estimate.mean, solid_angles)
+        if not isinstance(self._problem.reflection, InOutFactors):
+            return mean, mean, true(estimate.variance, solid_angles**2)
+        other = self._paths.elements(chosen.vertices, chosen.texels, self._seeds[3])
+        return mean, true(other.mean, solid_angles), np.zeros_like(mean)
 
-    def _halves(self, chosen: Chosen) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """White direct light (m,) twice, independently; it is the same where one ray tells all."""
-        first = self._rays.elements(chosen.vertices, chosen.texels).astype(np.float64)
-        if self._transport.basis == "direction":
+    def _sample(
+        self,
+        chosen: Chosen,
+        errors: tuple[Doubles, Doubles],
+        values: tuple[Doubles, Doubles],
+        variance: Doubles | float = 0.0,
+    ) -> Sample:
+        """From two estimates (m, rows, channels) each of the error and of the value, and the variance of products."""
+        gram = self._problem.reflection.gram(chosen.vertices).astype(np.float64)
+        found = []
+        for first, second in (errors, values):
+            own = first * second - variance  # [element, row, channel]
+            found.append(np.column_stack([_quadratic(gram, first, second, own), own.sum(axis=2)]))
+        return Sample(chosen.weights, *found)
+
+    def _halves(self, chosen: Chosen) -> tuple[Doubles, Doubles]:
+        """Direct light (m, rows, 1) twice, independently; it is the same where one ray tells all."""
+        first = self._true_direct(chosen, self._seeds[0])
+        if self._problem.basis == "direction":
             return first, first
-        second = self._rays.elements(chosen.vertices, chosen.texels, self._seeds[1])
-        return first, second.astype(np.float64)
+        return first, self._true_direct(chosen, self._seeds[1])
 
-    def _ours(self, part: AnyPart, chosen: Chosen) -> NDArray[np.float64]:
-        return elements(part, chosen.vertices, chosen.texels).astype(np.float64)
+    def _true_direct(self, chosen: Chosen, seed: int) -> Doubles:
+        asked = chosen.vertices, chosen.texels, seed
+        if self._rows_per_point(chosen) == 1:
+            return self._rays.elements(*asked).astype(np.float64)[:, None, None]
+        return self._term_rays.elements(*asked).astype(np.float64)[..., None]
+
+    def _rows_per_point(self, chosen: Chosen) -> int:
+        """R: chosen elements are of one mesh, and so of one BRDF."""
+        glossy = self._problem.reflection.glossy
+        is_glossy = len(glossy) and len(chosen.vertices) and np.isin(chosen.vertices[0], glossy)
+        return 1 + self._problem.reflection.terms if is_glossy else 1
+
+    def _ours(self, operator: Operator, chosen: Chosen) -> Doubles:
+        """Elements (m, rows, channels) of the matrix."""
+        rows = self._problem.reflection.rows_of_each(chosen.vertices, self._rows_per_point(chosen))
+        texels = np.repeat(chosen.texels, rows.shape[1])
+        found = operator.elements(rows.ravel(), texels)
+        return found.reshape(*rows.shape, -1).astype(np.float64)
 
 
-def relative(samples: list[Sample]) -> tuple[float, float]:
+def _quadratic(gram: Doubles, first: Doubles, second: Doubles, products: Doubles) -> Doubles:
+    """``first^T gram second`` summed over colours, (m,); of one row from its product. One channel stands for three."""
+    if gram.shape[1] == 1:
+        return (gram[:, 0] * products).sum(axis=(1, 2))
+    colours = (*gram.shape[:2], 3)
+    pair = np.broadcast_to(first, colours), np.broadcast_to(second, colours)
+    return np.einsum("mabc,mac,mbc->m", gram, *pair, optimize=True)
+
+
+def relative(samples: list[Sample], row: int = 0) -> tuple[float, float]:
     """Relative L2 and its standard error, from samples whose sums are added.
 
     Its square R^2 is a ratio of two sums; to first order it spreads as the sum of e - R^2 n does, e and n being the
     squared error and norm of an element (Cochran 1977, "Sampling Techniques", 6.11).
     """
-    norm = sum(float((s.weights * s.norms).sum()) for s in samples)
-    square = sum(float((s.weights * s.squares).sum()) for s in samples)
+    norm = sum(float((s.weights * s.norms[:, row]).sum()) for s in samples)
+    square = sum(float((s.weights * s.squares[:, row]).sum()) for s in samples)
     if norm <= 0:  # a black mesh
         return (0.0 if square <= 0 else 1.0), 0.0
     ratio = max(square, 0.0) / norm  # below zero is noise about zero
-    found, spread = float(np.sqrt(ratio)), float(np.sqrt(sum(_variance(s, ratio) for s in samples))) / norm
+    found, spread = (
+        float(np.sqrt(ratio)),
+        float(np.sqrt(sum(_variance(s, ratio, row) for s in samples))) / norm,
+    )
     # d sqrt(e) = de / (2 sqrt(e)); near zero the bound is that of sqrt(spread)
     return found, spread / (2 * found) if ratio > spread else float(np.sqrt(spread))
 
 
-def _variance(sample: Sample, ratio: float) -> float:
+def _variance(sample: Sample, ratio: float, row: int = 0) -> float:
     """Variance of the sum of e - R^2 n, elements having been drawn independently of each other.
 
     A few wrong elements may hold most of the squared error. Samples with few of them see too little spread as well,
     so the worst element is counted once more; where none is wrong, one average element may be.
     """
-    squares, norms = sample.weights * sample.squares, sample.weights * sample.norms
+    squares, norms = sample.weights * sample.squares[:, row], sample.weights * sample.norms[:, row]
     size = float(np.abs(norms).sum())
     if np.abs(squares).sum() <= ROUNDING**2 * size:
         return (float((norms**2).sum()) / max(size, 1e-300)) ** 2

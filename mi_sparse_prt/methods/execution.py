@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import counts
 from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.brute_force import exact_direct, path_traced
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.huang2010 import huang2010_parts
@@ -16,22 +19,29 @@ from mi_sparse_prt.methods.plan import TOGETHER, Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.methods.sparse import sparse_parts
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
-from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.reflection.factor_tables import incident_tables
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
-from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.radiosity import Gathered, RadiositySolver
+from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
-from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.transport import LightTransport
 
 
-class Evaluation:
+class Execution:
     """Evaluates the matrix of a scene by one plan after another; direct light is kept for the next plan.
 
     Parameters
     ----------
-    scene : Scene
+    problem : Problem
     direct : DirectSolver
         At the scene's vertices.
     settings : Settings
@@ -45,7 +55,7 @@ class Evaluation:
 
     def __init__(
         self,
-        scene: Scene,
+        problem: Problem,
         direct: DirectSolver,
         settings: Settings,
         indirect: bool,
@@ -53,7 +63,8 @@ class Evaluation:
         progress: bool,
         checkpoint_folder: str | Path | None = None,
     ) -> None:
-        self._scene, self._solver, self._settings, self._any_indirect = scene, direct, settings, indirect
+        self._problem, self._scene, self._solver = problem, problem.scene, direct
+        self._settings, self._any_indirect = settings, indirect
         self._clock, self.progress, self._folder = clock, progress, checkpoint_folder
         self._direct: dict[str, MethodResult] = {}
 
@@ -76,12 +87,22 @@ class Evaluation:
                 rays={"direct": 0},
             )
         find = {"exact": self._exact, "edges": self._edges, "consensus": self._consensus}[how]
-        self._direct[how] = find()
+        self._direct[how] = self._with_terms(find())
         return self._direct[how]
 
     def matrix(self, parts: MethodResult) -> LightTransport:
         """The matrix of evaluated parts, without a report."""
-        return matrix_of(self._scene, self._solver, parts)
+        return matrix_of(self._problem, parts)
+
+    def _with_terms(self, light: MethodResult) -> MethodResult:
+        """Direct light with rows for the terms of glossy vertices; they see what their vertices see."""
+        reflection = self._problem.reflection
+        if not isinstance(reflection, InOutFactors):
+            return light
+        assert isinstance(light.direct, Visibility | FractionalVisibility)
+        tables = incident_tables(reflection.factors)
+        factored = FactoredVisibility(light.direct, reflection.tangents, reflection.material, tables)
+        return replace(light, direct=factored)
 
     def _exact(self) -> MethodResult:
         return exact_direct(self._solver, self._scene, self._clock, self.progress)
@@ -103,6 +124,8 @@ class Evaluation:
 
     def _gathered(self, plan: Plan, light: MethodResult) -> MethodResult:
         """With interreflections by finite elements."""
+        if isinstance(light.direct, FactoredVisibility):
+            return self._gathered_terms(plan, light, light.direct)
         solver, settings = self._solver, self._settings
         with self._clock.phase("gather_rays"):
             nodes = choose_nodes(self._scene, solver.points)
@@ -117,17 +140,24 @@ class Evaluation:
             )
         with self._clock.phase("interreflection"):
             part = gather.indirect(light.direct, plan.tolerance)
-        skipped = [
-            f"interreflections after {part.bounces}: next to no light",
-            f"singular values of the first bounce below {part.left_out:.1%} of its energy's root",
-        ]
         rays = light.rays | {"gather": gather.rays}
-        return replace(light, indirect=part, rays=rays, skipped=skipped)
+        return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
+
+    def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
+        """With interreflections among glossy surfaces."""
+        with self._clock.phase("interreflection"):
+            seed = self._settings.seed
+            part, noise = glossy_indirect(self._problem, direct, plan.rays, plan.tolerance, seed)
+        rays = light.rays | {"gather": len(self._problem.points) * plan.rays}
+        account = _account(part) | {"noise_of_rays": noise}
+        return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=account)
 
     def _path_traced(self, plan: Plan, light: MethodResult) -> MethodResult:
         """With paths for all elements."""
         paths, lighting = self._paths(plan), self._solver.lighting
         part = path_traced(paths, lighting, self._clock, self.progress, self._checkpoint(plan))
+        if isinstance(paths, TermPaths):
+            part = _rows_of_terms(part, paths.colours, self._problem.reflection.glossy)
         elements = len(paths.points) * paths.lighting.n_directions
         return replace(
             light,
@@ -150,7 +180,7 @@ class Evaluation:
         )
 
     def _paths(self, plan: Plan) -> PathSolver:
-        return indirect_solver(self._scene, self._settings.of(plan))
+        return indirect_solver(self._problem, self._settings.of(plan))
 
     def _checkpoint(self, plan: Plan) -> Path | None:
         """A file name that stands for all that the rows of the indirect light, and their order, depend on."""
@@ -163,30 +193,50 @@ class Evaluation:
         return Path(self._folder) / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
 
 
-def matrix_of(scene: Scene, direct: DirectSolver, parts: MethodResult) -> LightTransport:
-    """The matrix of parts that were evaluated at a scene's vertices, without a report."""
+def _account(part: Gathered) -> dict[str, Any]:
+    return {"ranks": list(part.ranks), "bounces": part.bounces}
+
+
+def _left_out(part: Gathered) -> list[str]:
+    return [
+        f"interreflections after {part.bounces}: next to no light",
+        f"singular values of the first bounce below {part.left_out:.1%} of its energy's root",
+    ]
+
+
+def matrix_of(problem: Problem, parts: MethodResult) -> LightTransport:
+    """The matrix of parts that were evaluated, without a report."""
+    operators = {"direct": parts.direct} | ({} if parts.indirect is None else {"indirect": parts.indirect})
     return LightTransport(
-        lighting=direct.lighting,
-        basis=direct.basis,
-        albedo=scene.albedo,
-        areas=scene.vertex_areas,
-        direct=parts.direct,
-        indirect=parts.indirect,
-        meshes=tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes),
-        vertex_keys=direct.points.keys,
-        scene_hash=scene.hash,
+        problem.emission,
+        problem.basis,
+        problem.measurement,
+        problem.reflection,
+        operators,
+        problem.scene.hash,
     )
 
 
-def indirect_solver(scene: Scene, settings: Settings) -> PathSolver:
+def _rows_of_terms(part: Upsampled, colours: int, glossy: NDArray[np.int64]) -> Upsampled:
+    """Terms as rows of their own, after the unit-albedo rows, in place of channels (n, m, (1 + K) * colours)."""
+    n, m, channels = part.density.shape
+    by_row = part.density.reshape(n, m, channels // colours, colours)
+    terms = np.moveaxis(by_row[glossy, :, 1:], 2, 1).reshape(-1, m, colours)
+    return replace(part, density=np.concatenate([by_row[:, :, 0], terms]))
+
+
+def indirect_solver(problem: Problem, settings: Settings) -> PathSolver:
     """The path tracer that settings ask for, at the scene's vertices."""
+    if isinstance(problem.reflection, InOutFactors):
+        coarser = settings.coarse if settings.coarse.resolution != settings.resolution else None
+        return TermPaths(problem, settings.samples, settings.seed, coarser)
     return PathSolver(
-        scene.normalised,
+        problem.scene.normalised,
         settings.coarse,
-        vertex_points(scene),
+        problem.points,
         settings.indirect_basis,
         settings.max_depth,
         settings.samples,
-        1 if scene.grey else 3,
+        problem.channels,
         settings.seed,
     )

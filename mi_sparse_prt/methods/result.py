@@ -1,16 +1,11 @@
-"""What every method returns: the parts of a matrix, and an account of what was evaluated for them."""
+"""What every method returns: the operators of a matrix, and an account of what was evaluated for them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.operators.interpolated import Interpolated
-from mi_sparse_prt.operators.low_rank import LowRank
-from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.operators.upsampled import Upsampled
-from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.operators.operator import Operator
 
 
 @dataclass
@@ -19,7 +14,8 @@ class MethodResult:
 
     Attributes
     ----------
-    direct, indirect : Part or None
+    direct : Operator
+    indirect : Operator or None
     elements_evaluated : int
         Elements (vertex, direction) at which anything was evaluated, direct or indirect.
     elements : dict
@@ -30,12 +26,16 @@ class MethodResult:
         Sentences.
     sampling : dict
         Of methods that leave elements out: per mesh, how many vertices and directions were taken.
+    radiosity : dict
+        Of finite elements: ``ranks`` per channel, ``bounces``, and of glossy scenes ``noise_of_rays`` (relative L2, in
+        the first bounce).
     """
 
-    direct: Visibility | MeanCosine | FractionalVisibility | Interpolated
-    indirect: Upsampled | Interpolated | LowRank | None
+    direct: Operator
+    indirect: Operator | None
     elements_evaluated: int
     elements: dict[str, int]
     rays: dict[str, int]
     skipped: list[str] = field(default_factory=list)
     sampling: dict[str, Any] = field(default_factory=dict)
+    radiosity: dict[str, Any] = field(default_factory=dict)

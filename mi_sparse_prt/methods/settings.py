@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.methods.plan import BY_NAME, Plan
+from mi_sparse_prt.methods.plan import BY_NAME, TOGETHER, Plan
 
 METHODS = ("auto", *BY_NAME)
 BASES = ("direction", "texel")
@@ -32,6 +32,8 @@ class Settings:
     seed: int = 0
     indirect_resolution: int | None = None
     strata: int = 2
+    terms: int = 0
+    harmonics: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.method, str) and self.method not in METHODS:
@@ -54,14 +56,38 @@ class Settings:
             raise PrtError(f"max_depth is {self.max_depth}; 2 is direct light only, -1 is no limit")
         if self.target_error is not None and not self.target_error > 0:
             raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
+        self._check_terms()
         if self.coarse.resolution > self.resolution:
             raise PrtError(
                 f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
                 f"use at most {self.resolution}"
             )
 
+    def _check_terms(self) -> None:
+        if self.terms != int(self.terms) or self.terms < 0:
+            raise PrtError(f"terms must be at least 0, not {self.terms}; 4 is a good number")
+        plan = self.plan
+        if (
+            self.view_dependent
+            and plan is not None
+            and (plan.direct in TOGETHER or plan.direct == "exact" and self.basis == "texel")
+        ):
+            raise PrtError(
+                f"terms of glossy surfaces need one bit or share per texel, which method {self._name!r} does not give; "
+                'leave the method out, or set method="gather"'
+            )
+
+    @property
+    def view_dependent(self) -> bool:
+        """Whether terms of glossy surfaces are asked for."""
+        return self.terms > 0 or self.harmonics is not None
+
+    @property
+    def _name(self) -> str:
+        return self.method if isinstance(self.method, str) else "Plan"
+
     def _check_plan(self, plan: Plan) -> None:
-        name = self.method if isinstance(self.method, str) else "Plan"
+        name = self._name
         basis = {"exact": self.basis, "edges": "texel"}.get(plan.direct, "direction")
         if self.basis != basis:
             raise PrtError(f'method {name!r} works in the {basis} basis; set basis="{basis}"')

@@ -1,4 +1,4 @@
-"""Compressed white transport, direct and indirect light together: parts of a matrix like any other.
+"""Rows as points of affine spaces, one per cluster: clustered PCA of unit-albedo transport ([SHHS03], [HR10] 6).
 
 Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), whose L2 norm is that of the sphere.
 """
@@ -6,6 +6,7 @@ Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), whose L2 norm i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
@@ -13,14 +14,12 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.block_products import in_blocks
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-
-Rows = NDArray[np.integer]
-Floats = NDArray[np.float32]
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
 @dataclass(frozen=True)
-class Clustered:
-    """Rows as points of affine spaces, one per cluster of vertices ([SHHS03], [HR10] 6).
+class Clustered(Operator):
+    """Direct and indirect light together, compressed.
 
     Attributes
     ----------
@@ -34,6 +33,7 @@ class Clustered:
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "clustered"
     labels: NDArray[np.unsignedinteger]
     coefficients: NDArray[np.float16]
     means: NDArray[np.float16]
@@ -41,10 +41,14 @@ class Clustered:
     lighting: CubemapLighting
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.labels), self.lighting.n_directions, self.coefficients.shape[1]
+
+    @property
     def nbytes(self) -> int:
         return self.labels.nbytes + self.coefficients.nbytes + self.means.nbytes + self.bases.nbytes
 
-    def rows(self, ids: Rows) -> Floats:
+    def rows(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)
         n, channels, m = len(ids), self.coefficients.shape[1], self.means.shape[1]
         result = np.empty((n, channels, m), np.float32)
@@ -55,21 +59,53 @@ class Clustered:
             result[here] = along @ self.bases[c].astype(np.float32) + self.means[c]
         return np.ascontiguousarray(np.moveaxis(result * self._scale(), 1, 2))
 
-    def columns(self, ids: Rows) -> Floats:
+    def columns(self, ids: Ids) -> Floats:
         scale = self._scale()[ids]
-        return self._combined(
-            self.means[:, ids].astype(np.float32) * scale, self.bases[:, :, ids].astype(np.float32) * scale
-        )
+        means, bases = (x[..., ids].astype(np.float32) * scale for x in (self.means, self.bases))
+        return np.ascontiguousarray(np.moveaxis(self._combined(means, bases), 1, 2))
 
     def relight(self, lighting: Floats) -> Floats:
         means, products = self._products(lighting)
         return _relit(self.labels, self.coefficients.astype(np.float32), means, products)
 
-    def project(self, vectors: Floats) -> Floats:
-        return self._combined(*self._products(vectors))
+    def _apply_same(self, x: Floats) -> Floats:
+        return self._combined(*self._products(x))
 
-    def reordered(self, source: Rows) -> Clustered:
-        return replace(self, labels=self.labels[source], coefficients=self.coefficients[source])
+    def _apply_each(self, x: Floats) -> Floats:
+        return np.stack(
+            [self._combined(*self._products(x[:, c]), slice(c, c + 1))[:, 0] for c in range(3)], axis=1
+        )
+
+    def _adjoint_by_rows(self, y: Floats) -> Floats:
+        """By clusters, not by rows: ``y`` is gathered in coefficients of means and of basis vectors."""
+        result = np.zeros((self.shape[1], *y.shape[1:]), np.float32)
+        for c in range(len(self.means)):
+            here = np.flatnonzero(self.labels == c)
+            along = self.coefficients[here].astype(np.float32)  # [vertex, channel, vector]
+            weights = np.einsum("ncb,nck->cbk", along, y[here])
+            base, mean = self.bases[c].astype(np.float32), self.means[c].astype(np.float32)
+            result += np.einsum("bm,cbk->mck", base, weights, optimize=True)
+            result += mean[:, None, None] * y[here].sum(axis=0)
+        return result * self._scale()[:, None, None]
+
+    def take(self, ids: Ids) -> Clustered:
+        return replace(self, labels=self.labels[ids], coefficients=self.coefficients[ids])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        names = ("labels", "coefficients", "means", "bases")
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        labels, coefficients, means, bases = (arrays[n] for n in ("labels", "coefficients", "means", "bases"))
+        # a wrong label would read beyond the clusters
+        if coefficients.shape[1] not in (1, 3) or (len(labels) and labels.max() >= len(means)):
+            raise ValueError("clusters and their vertices do not fit together")
+        if bases.shape[:2] != (len(means), coefficients.shape[2]) or len(labels) != len(coefficients):
+            raise ValueError("basis vectors and coefficients do not fit together")
+        if not means.shape[1] == bases.shape[2] == lighting.n_directions:
+            raise ValueError("clusters do not fit the lighting")
+        return cls(labels, coefficients, means, bases, lighting)
 
     def _products(self, vectors: Floats) -> tuple[Floats, Floats]:
         """Of means (k, any) and of basis vectors (k, b, any) with vectors (n_directions, any)."""
@@ -79,14 +115,14 @@ class Clustered:
             k, b, -1
         )
 
-    def _combined(self, means: Floats, products: Floats) -> Floats:
-        """What vertices have where means have (k, any) and basis vectors (k, b, any): (n_v, any, channels)."""
-        n, channels, _ = self.coefficients.shape
-        result = np.empty((n, means.shape[1], channels), np.float32)
+    def _combined(self, means: Floats, products: Floats, channels: slice = slice(None)) -> Floats:
+        """What rows have where means have (k, any) and basis vectors (k, b, any): (n, channels, any)."""
+        coefficients = self.coefficients[:, channels]
+        result = np.empty((*coefficients.shape[:2], means.shape[1]), np.float32)
         for c in range(len(means)):
             here = np.flatnonzero(self.labels == c)
-            along = self.coefficients[here].astype(np.float32)  # [vertex, channel, vector]
-            result[here] = np.moveaxis(along @ products[c] + means[c], 1, 2)
+            along = coefficients[here].astype(np.float32)  # [vertex, channel, vector]
+            result[here] = along @ products[c] + means[c]
         return result
 
     def _scale(self) -> Floats:
@@ -97,7 +133,7 @@ class Clustered:
 def _relit(
     labels: NDArray[np.unsignedinteger], coefficients: Floats, means: Floats, products: Floats
 ) -> Floats:
-    """White radiance (n_v, 3); coefficients (n_v, 1 or 3, b), means (k, 3), products (k, b, 3)."""
+    """Radiance (n, 3); coefficients (n_v, 1 or 3, b), means (k, 3), products (k, b, 3)."""
     n, channels, b = coefficients.shape
     radiance = np.empty((n, 3), np.float32)
     for i in numba.prange(n):

@@ -1,166 +1,246 @@
-"""Direct light of glossy vertices, one row for each term of their BRDF; visibility is that of the vertex.
+"""Direct light of glossy points, one row for each term of their BRDF; visibility is that of the point.
 
-``T_k(x, j) = f_k(w_j in the frame of x) V(x, w_j) d_omega_j`` ([HR10] eq. 3), f_k of either sign.
+``T_k(x, j) = f_k(w_j in the frame of x) V(x, w_j) d_omega_j`` ([HR10] eq. 3), f_k of either sign. In the texel basis V
+is the visible share of the texel, and f_k that of its centre.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.frames import frames
 
 LANES = 4  # terms at a time
 
-Rows = NDArray[np.integer]
-Floats = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
-class FactoredVisibility:
-    """White direct transport of all vertices, followed by the terms of the glossy ones.
+class FactoredVisibility(Operator):
+    """Unit-albedo direct transport of all points, followed by the terms of the glossy ones.
 
-    Row i < n_v is that of ``Visibility``; row ``n_v + K * i + k`` is term k of the i-th glossy vertex.
+    Row i < n is that of ``visibility``; row ``n + K * i + k`` is term k of the i-th glossy point.
 
     Attributes
     ----------
-    bits : (n_v, n_directions / 32) uint32
-    normals : (n_v, 3) float32, world
-    lighting : CubemapLighting
-    glossy : (n_g,) int64
-        Numbers of the glossy vertices.
-    frames : (n_g, 3, 3) float32
-        From the world to their frames.
-    materials : (n_g,) int64
-        Which table.
+    visibility : Visibility or FractionalVisibility
+        Of all n points.
+    tangents : (n, 3) float32, world
+    material : (n,) int64
+        Which table, -1 at points that are not glossy.
     tables : (materials, size, size, K) float32
         f_k (``reflection.factor_tables``).
     """
 
-    bits: NDArray[np.uint32]
-    normals: Floats
-    lighting: CubemapLighting
-    glossy: NDArray[np.int64]
-    frames: Floats
-    materials: NDArray[np.int64]
+    kind: ClassVar[str] = "factored_visibility"
+    visibility: Visibility | FractionalVisibility
+    tangents: Floats
+    material: NDArray[np.int64]
     tables: Floats
+
+    @property
+    def lighting(self) -> CubemapLighting:
+        return self.visibility.lighting
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        n, m, _ = self.visibility.shape
+        return n + len(self.glossy) * self.terms, m, 1
 
     @property
     def terms(self) -> int:
         """K."""
         return self.tables.shape[3]
 
-    @property
-    def count(self) -> int:
-        """Rows."""
-        return len(self.bits) + len(self.glossy) * self.terms
+    @cached_property
+    def glossy(self) -> NDArray[np.int64]:
+        """Numbers of the glossy points, (n_g,)."""
+        return np.flatnonzero(self.material >= 0)
+
+    @cached_property
+    def frames(self) -> Floats:
+        """(n_g, 3, 3), from the world to the frames of the glossy points."""
+        return frames(self.tangents[self.glossy], self.visibility.normals[self.glossy])
 
     @property
     def nbytes(self) -> int:
-        return self.bits.nbytes + self.frames.nbytes + self.tables.nbytes
-
-    @cached_property
-    def white(self) -> Visibility:
-        """The rows of all vertices."""
-        return Visibility(self.bits, self.normals, self.lighting)
+        return self.visibility.nbytes + self.tangents.nbytes + self.material.nbytes + self.tables.nbytes
 
     @cached_property
     def _padded(self) -> Floats:
         """Tables with as many terms as vector instructions take."""
         return np.pad(self.tables, ((0, 0), (0, 0), (0, 0), (0, -self.terms % LANES)))
 
-    def with_rows(self, ids: Rows) -> tuple[FactoredVisibility, NDArray[np.int64]]:
-        """A smaller part that has some rows, and where in it they are (len(ids),)."""
-        ids, n = np.asarray(ids), len(self.bits)
-        which, term = np.divmod(np.maximum(ids - n, 0), self.terms)
-        is_term = ids >= n
-        vertices = np.unique(np.where(is_term, self.glossy[which], ids))
-        kept = np.flatnonzero(np.isin(self.glossy, vertices))
-        part = replace(
-            self,
-            bits=self.bits[vertices],
-            normals=self.normals[vertices],
-            glossy=np.searchsorted(vertices, self.glossy[kept]),
-            frames=self.frames[kept],
-            materials=self.materials[kept],
-        )
-        as_term = len(vertices) + np.searchsorted(kept, which) * self.terms + term
-        place = np.where(is_term, as_term, np.searchsorted(vertices, ids))
-        return part, place
+    @cached_property
+    def _seen(self) -> tuple[NDArray[Any], ...]:
+        """Bits of all points, and where some texels are seen in part: starts, texels, shares."""
+        return self.visibility.bits, *self.visibility.listed
 
-    def rows(self, ids: Rows) -> Floats:
+    def _points(self, which: Ids) -> tuple[NDArray[Any], ...]:
+        """Numbers, frames, tables' numbers and tables of some glossy points."""
+        vertices = self.glossy[which]
+        return vertices, self.frames[which], self.material[vertices], self._padded
+
+    @property
+    def _all(self) -> tuple[NDArray[Any], ...]:
+        return self._points(np.arange(len(self.glossy)))
+
+    def rows(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)
         result = np.empty((len(ids), self.lighting.n_directions, 1), np.float32)
-        dull = ids < len(self.bits)
-        result[dull] = self.white.rows(ids[dull])
-        which, term = np.divmod(ids[~dull] - len(self.bits), self.terms)
+        diffuse = ids < len(self.material)
+        result[diffuse] = self.visibility.rows(ids[diffuse])
+        which, term = np.divmod(ids[~diffuse] - len(self.material), self.terms)
         distinct, place = np.unique(which, return_inverse=True)
         terms = self._term_values(distinct, np.arange(self.lighting.n_directions))
-        result[~dull, :, 0] = terms[place, term]
+        result[~diffuse, :, 0] = terms[place, term]
         return result
 
-    def columns(self, ids: Rows) -> Floats:
-        return np.concatenate([self.white.columns(ids), self.term_columns(ids)[..., None]])
+    def columns(self, ids: Ids) -> Floats:
+        return np.concatenate([self.visibility.columns(ids), self._term_columns(ids)[..., None]])
 
-    def term_columns(self, ids: Rows) -> Floats:
-        """Columns of the terms alone, (n_g * K, len(ids))."""
-        return self._term_values(np.arange(len(self.glossy)), np.asarray(ids)).reshape(-1, len(ids))
+    def dense_columns(self, texels: Ids, out: Floats) -> Floats:
+        n = len(self.material)
+        diffuse = self.visibility.dense_columns(texels, out[:n])
+        if diffuse.base is not out:
+            out[:n] = diffuse
+        out[n:] = self._term_columns(texels)
+        return out
+
+    def _term_columns(self, texels: Ids) -> Floats:
+        """Columns of the terms alone, (n_g * K, len(texels))."""
+        return self._term_values(np.arange(len(self.glossy)), np.asarray(texels)).reshape(-1, len(texels))
 
     def relight(self, lighting: Floats) -> Floats:
-        directions, power = np.ascontiguousarray(self.lighting.directions.T), self._power(lighting)
-        own = self.glossy, self.frames, self.materials, self._padded
-        return np.concatenate(
-            [
-                self.white.relight(lighting),
-                _relit(self.bits, *own, directions, power, self.terms).reshape(-1, 3),
-            ]
-        )
-
-    def reordered(self, source: Rows) -> FactoredVisibility:
-        """The part of other vertices: ``source`` numbers those of this one, each at most once."""
-        number = np.full(len(self.bits), -1)
-        number[self.glossy] = np.arange(len(self.glossy))
-        kept = number[source][number[source] >= 0]
-        return replace(
-            self,
-            bits=self.bits[source],
-            normals=self.normals[source],
-            glossy=np.flatnonzero(number[source] >= 0),
-            frames=self.frames[kept],
-            materials=self.materials[kept],
-        )
-
-    def project(self, vectors: Floats) -> Floats:
-        return rows_times(self.rows, self.count, vectors)
+        directions = np.ascontiguousarray(self.lighting.directions.T)
+        power = (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
+        arguments: Any = (*self._seen, *self._all, directions, power, self.terms)
+        terms = _relit(*arguments)
+        return np.concatenate([self.visibility.relight(lighting), terms.reshape(-1, 3)])
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
-        """Sums of the terms' columns at the same place in some words of bits, with signs: (n_g * K, bits of a word)."""
         texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
         directions = np.ascontiguousarray(np.moveaxis(self.lighting.directions[texels], 2, 1))
-        power = signs * self.lighting.solid_angles[texels]
-        own = self.glossy, self.frames, self.materials, self._padded
-        places = np.asarray(words, np.int64)
-        found = _combined(self.bits, *own, places, directions, power.astype(np.float32), self.terms)
-        return found.reshape(-1, signs.shape[1])
+        power = (signs * self.lighting.solid_angles[texels]).astype(np.float32)
+        place = np.full(-(-self.lighting.n_directions // signs.shape[1]), -1)
+        place[words] = np.arange(len(words))
+        chosen = np.asarray(words, np.int64), place, directions, power, self.terms
+        arguments: Any = (*self._seen, *self._all, *chosen)
+        found = _combined(*arguments)
+        return np.concatenate([self.visibility.combined(words, signs), found.reshape(-1, signs.shape[1])])
 
-    def _term_values(self, which: Rows, texels: Rows) -> Floats:
-        """Terms (n, K, m) of some glossy vertices at some texels."""
-        some = self.glossy[which], self.frames[which], self.materials[which], self._padded
+    def masked(self, points: NDArray[np.int64], open: Bits) -> FactoredVisibility:
+        """Without what points, and so all of their rows, lose; ``points`` are no terms."""
+        return replace(self, visibility=self.visibility.masked(points, open))
+
+    def take(self, ids: Ids) -> Operator:
+        """Any rows; those of whole points, all unit-albedo rows first and then all terms, stay this kind."""
+        ids, n = np.asarray(ids), len(self.material)
+        which, term = np.divmod(np.maximum(ids - n, 0), self.terms)
+        is_term = ids >= n
+        points = ids[~is_term]
+        part = self._of_points(points)
+        if np.array_equal(ids, self._rows_of(points)):
+            return part
+        vertices = np.unique(np.where(is_term, self.glossy[which], ids))
+        part = self._of_points(vertices)
+        own = np.searchsorted(vertices[part.glossy], self.glossy[which[is_term]])
+        place = np.searchsorted(vertices, ids)
+        place[is_term] = len(vertices) + own * self.terms + term[is_term]
+        return RowSelection(part, place)
+
+    def _of_points(self, points: Ids) -> FactoredVisibility:
+        return replace(
+            self,
+            visibility=self.visibility.take(points),
+            tangents=self.tangents[points],
+            material=self.material[points],
+        )
+
+    def _rows_of(self, points: Ids) -> NDArray[np.int64]:
+        """All rows of some points: unit-albedo rows, then terms."""
+        own = np.searchsorted(self.glossy, points[self.material[points] >= 0])
+        terms = len(self.material) + own[:, None] * self.terms + np.arange(self.terms)
+        return np.concatenate([points, terms.ravel()])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        names = ("visibility", "tangents", "material", "tables")
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        visibility, tangents, material, tables = (
+            arrays[name] for name in ("visibility", "tangents", "material", "tables")
+        )
+        n = visibility.shape[0]
+        if tangents.shape != (n, 3) or material.shape != (n,):
+            raise ValueError("vertices and their tangents do not fit together")
+        # a wrong number would read beyond the tables
+        if n and not -1 <= material.min() <= material.max() < len(tables):
+            raise ValueError("tables of incident factors and their vertices do not fit together")
+        if tables.ndim != 4 or tables.shape[1] != tables.shape[2]:
+            raise ValueError("tables of incident factors are not square")
+        return cls(visibility, tangents, material, tables)
+
+    def _term_values(self, which: Ids, texels: Ids) -> Floats:
+        """Terms (n, K, m) of some glossy points at some texels."""
         directions = np.ascontiguousarray(self.lighting.directions[texels].T)
-        words, shifts = np.divmod(np.asarray(texels, np.int64), BITS)
         power = self.lighting.solid_angles[texels].astype(np.float32)
-        return _expanded(self.bits, *some, words, shifts.astype(np.uint32), directions, power, self.terms)
+        asked = np.asarray(texels, np.int64)
+        arguments: Any = (*self._seen, *self._points(which), asked, directions, power, self.terms)
+        return _expanded(*arguments)
 
-    def _power(self, lighting: Floats) -> Floats:
-        return (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
+
+@dataclass(frozen=True)
+class RowSelection(Operator):
+    """Some rows of an operator, repeated or in any order; kept in memory only.
+
+    Attributes
+    ----------
+    operator : Operator
+    place : (n,) int64
+        Which of its rows.
+    """
+
+    kind: ClassVar[str] = "row_selection"
+    operator: Operator
+    place: NDArray[np.int64]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.place), *self.operator.shape[1:]
+
+    @property
+    def nbytes(self) -> int:
+        return self.operator.nbytes + self.place.nbytes
+
+    def rows(self, ids: Ids) -> Floats:
+        return self.operator.rows(self.place[ids])
+
+    def columns(self, ids: Ids) -> Floats:
+        return self.operator.columns(ids)[self.place]
+
+    def relight(self, lighting: Floats) -> Floats:
+        return self.operator.relight(lighting)[self.place]
+
+    def take(self, ids: Ids) -> RowSelection:
+        return replace(self, place=self.place[ids])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {"operator": self.operator, "place": self.place}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        return cls(arrays["operator"], arrays["place"])
 
 
 @numba.njit(fastmath=True, inline="always")
@@ -195,26 +275,35 @@ def _add(
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _expanded(
     bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    listed: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
     vertices: NDArray[np.int64],
     frames: Floats,
     materials: NDArray[np.int64],
     tables: Floats,
-    words: NDArray[np.int64],
-    shifts: NDArray[np.uint32],
+    texels: NDArray[np.int64],
     directions: Floats,
     power: Floats,
     terms: int,
 ) -> Floats:
-    """Terms (n, terms, m) at directions (3, m)."""
-    result = np.zeros((len(vertices), terms, len(words)), np.float32)
+    """Terms (n, terms, m) at texels (m,), whose directions are (3, m)."""
+    result = np.zeros((len(vertices), terms, len(texels)), np.float32)
     for i in numba.prange(len(vertices)):
         value = np.empty((1, tables.shape[3]), np.float32)
-        for j in range(len(words)):
-            if (bits[vertices[i], words[j]] >> shifts[j]) & np.uint32(1) == 0:
+        first, last = starts[vertices[i]], starts[vertices[i] + 1]
+        own = listed[first:last]
+        for j in range(len(texels)):
+            weight = power[j] * np.float32(bit_of(bits[vertices[i]], texels[j]))
+            if len(own):
+                e = np.searchsorted(own, texels[j])
+                if e < len(own) and own[e] == texels[j]:
+                    weight = power[j] * (np.float32(shares[first + e]) / np.float32(FULL))
+            if weight == 0:
                 continue
             u, v, w = directions[0, j], directions[1, j], directions[2, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, power[j])
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
             for k in range(terms):
                 result[i, k, j] = value[0, k]
     return result
@@ -223,6 +312,9 @@ def _expanded(
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _relit(
     bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    listed: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
     vertices: NDArray[np.int64],
     frames: Floats,
     materials: NDArray[np.int64],
@@ -245,6 +337,15 @@ def _relit(
             for c in range(3):
                 for k in range(tables.shape[3]):
                     total[c, k] += value[0, k] * power[j, c]
+        for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
+            j = listed[e]
+            more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
+            u, v, w = directions[0, j], directions[1, j], directions[2, j]
+            value[:] = 0
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, more)
+            for c in range(3):
+                for k in range(tables.shape[3]):
+                    total[c, k] += value[0, k] * power[j, c]
         result[i] = total.T[:terms]
     return result
 
@@ -252,16 +353,23 @@ def _relit(
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _combined(
     bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    listed: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
     vertices: NDArray[np.int64],
     frames: Floats,
     materials: NDArray[np.int64],
     tables: Floats,
     words: NDArray[np.int64],
+    place: NDArray[np.int64],
     directions: Floats,
     power: Floats,
     terms: int,
 ) -> Floats:
-    """Sums (n, terms, b) over words of the terms at their bits; directions (words, 3, b), power (words, b)."""
+    """Sums (n, terms, b) over words of the terms at their bits; directions (words, 3, b), power (words, b).
+
+    ``place`` says where among ``words`` a word is, or -1.
+    """
     width = power.shape[1]
     result = np.empty((len(vertices), terms, width), np.float32)
     for i in numba.prange(len(vertices)):
@@ -275,5 +383,13 @@ def _combined(
                     continue
                 u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
                 _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b])
+        for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
+            j = int(listed[e])
+            g, b = place[j // width], j % width
+            if g < 0:
+                continue
+            more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
+            u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
+            _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b] * more)
         result[i] = total.T[:terms]
     return result

@@ -7,24 +7,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS, bit_of
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.bits import BITS, Bits, bit_of, bits_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.visibility import check_bits
 
 FULL = 255  # a share of 1
 _PARTS = 256  # of a face per axis, over which directions are averaged
 
-Ids = NDArray[np.integer]
-Floats = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
-class FractionalVisibility:
+class FractionalVisibility(Operator):
     """One bit per element, and 8 more where an edge of visibility cuts the texel.
 
     Attributes
@@ -41,6 +41,7 @@ class FractionalVisibility:
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "fractional_visibility"
     bits: NDArray[np.uint32]
     starts: NDArray[np.int64]
     texels: NDArray[np.unsignedinteger]
@@ -49,11 +50,24 @@ class FractionalVisibility:
     lighting: CubemapLighting
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.bits), self.lighting.n_directions, 1
+
+    @property
+    def listed(self) -> tuple[NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
+        """``starts``, ``texels`` and ``shares``."""
+        return self.starts, self.texels, self.shares
+
+    @property
+    def edges(self) -> Bits | None:
+        return self.bits
+
+    @property
     def nbytes(self) -> int:
         return self.bits.nbytes + self.starts.nbytes + self.texels.nbytes + self.shares.nbytes
 
     def rows(self, ids: Ids) -> Floats:
-        return self.reordered(ids)._expanded(np.arange(self.lighting.n_directions))
+        return self.take(ids)._expanded(np.arange(self.lighting.n_directions))
 
     def columns(self, ids: Ids) -> Floats:
         distinct, place = np.unique(np.asarray(ids, np.int64), return_inverse=True)
@@ -67,11 +81,16 @@ class FractionalVisibility:
         listed = self.starts, self.texels, self.shares
         return _relight(self.bits, *listed, self.normals, directions, ramps, power)
 
-    def project(self, vectors: Floats) -> Floats:
-        return rows_times(self.rows, len(self.bits), vectors)
+    def masked(self, points: NDArray[np.int64], open: Bits) -> FractionalVisibility:
+        bits, shares, first = self.bits.copy(), self.shares.copy(), self.starts[points]
+        bits[points] &= open
+        lengths = self.starts[points + 1] - first
+        row = np.repeat(np.arange(len(lengths)), lengths)
+        entries = np.arange(len(row)) + (first - np.cumsum(lengths) + lengths)[row]
+        shares[entries] *= bits_at(open, row, self.texels[entries]).astype(np.uint8)
+        return replace(self, bits=bits, shares=shares)
 
-    def reordered(self, source: Ids) -> FractionalVisibility:
-        """Some rows, in this order."""
+    def take(self, source: Ids) -> FractionalVisibility:
         source = np.asarray(source)
         counts = np.diff(self.starts)[source]
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -86,10 +105,27 @@ class FractionalVisibility:
         )
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
-        """White elements (m,) of vertices and texels (m,) each."""
         beams = *_means(self.lighting.resolution), self._weights()
         asked = np.asarray(ids, np.int64), np.asarray(texels, np.int64)
-        return _single(self.bits, self.starts, self.texels, self.shares, self.normals, *beams, *asked)
+        return _single(self.bits, self.starts, self.texels, self.shares, self.normals, *beams, *asked)[
+            :, None
+        ]
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        listed = {"starts": self.starts, "texels": self.texels, "shares": self.shares}
+        return {"visibility": self.bits, "normals": self.normals, **listed}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        names = ("visibility", "starts", "texels", "shares", "normals")
+        bits, starts, texels, shares, normals = (arrays[name] for name in names)
+        check_bits(bits, normals, lighting)
+        # nothing that uses the lists looks whether they make sense
+        matrix = scipy.sparse.csr_array((shares, texels, starts), shape=(len(bits), lighting.n_directions))
+        matrix.check_format(full_check=True)
+        if not matrix.has_canonical_format:
+            raise ValueError("texels that are seen in part are not in order")
+        return cls(bits, starts, texels, shares, normals, lighting)
 
     def _expanded(self, ids: Ids) -> Floats:
         """Elements (n_v, k, 1) of texels (k,), no texel twice."""

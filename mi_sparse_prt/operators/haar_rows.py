@@ -1,4 +1,4 @@
-"""Rows of white transport as lists of Haar wavelet coefficients: a part of a matrix like any other ([NRH03]).
+"""Rows of unit-albedo transport as lists of Haar wavelet coefficients ([NRH03]).
 
 Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), for which the wavelets are orthonormal.
 """
@@ -6,6 +6,7 @@ Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), for which the w
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
@@ -14,14 +15,12 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar, inverse_haar
-
-Ids = NDArray[np.integer]
-Floats = NDArray[np.float32]
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
 @dataclass(frozen=True)
-class HaarRows:
-    """Rows as lists of wavelet coefficients: a part of a matrix that is compressed white transport.
+class HaarRows(Operator):
+    """Direct and indirect light together, compressed.
 
     Attributes
     ----------
@@ -36,6 +35,7 @@ class HaarRows:
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "haar_rows"
     starts: NDArray[np.int64]
     places: NDArray[np.unsignedinteger]
     values: NDArray[np.float16]
@@ -43,11 +43,15 @@ class HaarRows:
     lighting: CubemapLighting
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.scales), self.lighting.n_directions, self.scales.shape[1]
+
+    @property
     def nbytes(self) -> int:
         return self.starts.nbytes + self.places.nbytes + self.values.nbytes + self.scales.nbytes
 
     def rows(self, ids: Ids) -> Floats:
-        some, m = self.reordered(ids), self.lighting.n_directions
+        some, m = self.take(ids), self.lighting.n_directions
         values = some.values * np.repeat(some.scales.ravel(), np.diff(some.starts))
         lists = (values, some.places.astype(np.int32), some.starts)
         coefficients = scipy.sparse.csr_array(lists, shape=(some.scales.size, m)).toarray()
@@ -58,7 +62,7 @@ class HaarRows:
         ids = np.asarray(ids)
         single = np.zeros((self.lighting.n_directions, len(ids)), np.float32)
         single[ids, np.arange(len(ids))] = 1
-        return self.project(single)
+        return np.ascontiguousarray(np.moveaxis(self._apply_same(single), 1, 2))
 
     def relight(self, lighting: Floats) -> Floats:
         colours = self._transformed(lighting)
@@ -66,10 +70,28 @@ class HaarRows:
             return self._products(np.ascontiguousarray(colours.T[..., None]))[..., 0]
         return self._products(colours[None])[:, 0]
 
-    def project(self, vectors: Floats) -> Floats:
-        return np.ascontiguousarray(np.moveaxis(self._products(self._transformed(vectors)[None]), 1, 2))
+    def _apply_same(self, x: Floats) -> Floats:
+        return self._products(self._transformed(x)[None])
 
-    def reordered(self, source: Ids) -> HaarRows:
+    def _apply_each(self, x: Floats) -> Floats:
+        return self._products(np.stack([self._transformed(x[:, c]) for c in range(3)]))
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {name: getattr(self, name) for name in ("starts", "places", "values", "scales")}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        starts, places, values, scales = (arrays[n] for n in ("starts", "places", "values", "scales"))
+        if scales.shape[1] not in (1, 3) or places.shape != values.shape or values.dtype != np.float16:
+            raise ValueError("wavelet coefficients and their vertices do not fit together")
+        # a wrong list would read beyond the lighting's coefficients
+        matrix = scipy.sparse.csr_array((places, places, starts), shape=(scales.size, lighting.n_directions))
+        matrix.check_format(full_check=True)
+        if not matrix.has_canonical_format:
+            raise ValueError("wavelet coefficients are not in order")
+        return cls(starts, places, values, scales, lighting)
+
+    def take(self, source: Ids) -> HaarRows:
         channels = self.scales.shape[1]
         lists = (np.asarray(source, np.int64)[:, None] * channels + np.arange(channels)).ravel()
         counts = np.diff(self.starts)[lists]

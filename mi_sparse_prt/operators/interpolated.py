@@ -1,57 +1,105 @@
-"""Rows of all vertices as combinations of a few dense rows: A D ([HR10] eq. 4)."""
+"""Rows of all points as combinations of a few dense rows: A D ([HR10] eq. 4)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.operators.operator import Rows
-from mi_sparse_prt.operators.upsampled import Upsampled
-from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
+
+_ELEMENTS = 1 << 15  # at a time; each has up to 40 dense ones
 
 
 @dataclass(frozen=True)
-class Interpolated:
-    """Rows of all vertices as combinations of a few dense rows: A D ([HR10] eq. 4).
+class Interpolated(Operator):
+    """A D.
 
     Attributes
     ----------
-    dense : Visibility or Upsampled
-        D, the rows of the densely sampled vertices.
-    weights : (n_v, n_dense) sparse float32
-        A: a row has the weights of a vertex's dense neighbours. That of a dense vertex is 1 at itself (``huang2010``)
+    dense : Operator
+        D, the rows of the densely sampled points.
+    weights : (n, n_dense) sparse float32
+        A: a row has the weights of a point's dense neighbours. That of a dense point is 1 at itself (``huang2010``)
         or smooths its row by its neighbours' (``sparse``).
     """
 
-    dense: Visibility | Upsampled
+    kind: ClassVar[str] = "interpolated"
+    dense: Operator
     weights: scipy.sparse.csr_array
 
     @property
-    def nbytes(self) -> int:
-        weights = self.weights
-        return self.dense.nbytes + weights.data.nbytes + weights.indices.nbytes + weights.indptr.nbytes
+    def shape(self) -> tuple[int, int, int]:
+        return self.weights.shape[0], *self.dense.shape[1:]
 
-    def rows(self, ids: Rows) -> NDArray[np.float32]:
+    @property
+    def nbytes(self) -> int:
+        return self.dense.nbytes + sparse_nbytes(self.weights)
+
+    def rows(self, ids: Ids) -> Floats:
         weights = self.weights[np.asarray(ids)]
         needed = np.unique(weights.indices)
         dense = self.dense.rows(needed)  # [needed dense row, direction, channel]
         flat = weights[:, needed] @ dense.reshape(len(needed), dense.shape[1] * dense.shape[2])
         return flat.reshape(len(ids), *dense.shape[1:])
 
-    def columns(self, ids: Rows) -> NDArray[np.float32]:
-        dense = self.dense.columns(ids)  # [dense row, column, channel]
+    def columns(self, ids: Ids) -> Floats:
+        return self._interpolate(self.dense.columns(ids))
+
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
+        return np.concatenate([self._elements(ids[b], texels[b]) for b in blocks])
+
+    def _elements(self, ids: Ids, texels: Ids) -> Floats:
+        element, dense, weights = row_entries(self.weights, ids)
+        return summed_entries(element, weights, self.dense.elements(dense, texels[element]), len(ids))
+
+    def relight(self, lighting: Floats) -> Floats:
+        return self.weights @ self.dense.relight(lighting)
+
+    def apply(self, x: Floats) -> Floats:
+        return self._interpolate(self.dense.apply(x))
+
+    def adjoint(self, y: Floats) -> Floats:
+        flat = self.weights.T @ np.asarray(y, np.float32).reshape(len(y), -1)
+        return self.dense.adjoint(flat.reshape(-1, *y.shape[1:]))
+
+    def _interpolate(self, dense: Floats) -> Floats:
+        """Values (n_dense, ...) at all points."""
         flat = self.weights @ dense.reshape(len(dense), -1)
         return flat.reshape(len(flat), *dense.shape[1:])
 
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        return self.weights @ self.dense.relight(lighting)
+    def take(self, ids: Ids) -> Interpolated:
+        return replace(self, weights=self.weights[ids])
 
-    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        dense = self.dense.project(vectors)  # [dense row, vector, channel]
-        return (self.weights @ dense.reshape(len(dense), -1)).reshape(-1, *dense.shape[1:])
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {"dense": self.dense, **sparse_to_arrays("weights", self.weights)}
 
-    def reordered(self, source: Rows) -> Interpolated:
-        return replace(self, weights=self.weights[source])
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        dense = arrays["dense"]
+        return cls(dense, sparse_from_arrays("weights", arrays, dense.shape[0]))
+
+
+def row_entries(
+    matrix: scipy.sparse.csr_array, rows: Ids
+) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.floating]]:
+    """Position in ``rows``, column and value of all entries of these rows of a matrix."""
+    counts = np.diff(matrix.indptr)[rows]
+    position = np.repeat(np.arange(len(rows)), counts)
+    within = np.arange(len(position)) - np.repeat(np.cumsum(counts) - counts, counts)
+    entry = matrix.indptr[rows][position] + within
+    return position, matrix.indices[entry], matrix.data[entry]
+
+
+def summed_entries(
+    element: NDArray[np.int64], weights: NDArray[np.floating], values: Floats, n: int
+) -> Floats:
+    """Sums of weighted entries (entries, channels) over their elements, (n, channels)."""
+    channels = [np.bincount(element, weights * v, minlength=n) for v in values.T]
+    return np.stack(channels, axis=1).astype(np.float32)

@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.operators.operator import Rows
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+
+_ELEMENTS = 1 << 15  # at a time
 
 
 @dataclass(frozen=True)
-class LowRank:
-    """Interreflected light as a product of two thin matrices per channel: it has a low rank.
+class LowRank(Operator):
+    """``left @ right`` for each channel.
 
     Attributes
     ----------
-    left : tuple of (n_v, rank) float32
+    left : tuple of (n, rank) float32
         One per channel: 1 in a grey scene, else 3. Ranks may differ.
     right : tuple of (rank, n_directions) float32
     """
 
+    kind: ClassVar[str] = "low_rank"
     left: tuple[NDArray[np.float32], ...]
     right: tuple[NDArray[np.float32], ...]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.left[0]), self.right[0].shape[1], len(self.left)
 
     @property
     def ranks(self) -> tuple[int, ...]:
@@ -33,21 +42,54 @@ class LowRank:
     def nbytes(self) -> int:
         return sum(factor.nbytes for factor in (*self.left, *self.right))
 
-    def rows(self, ids: Rows) -> NDArray[np.float32]:
+    def rows(self, ids: Ids) -> Floats:
         channels = [a[ids] @ b for a, b in zip(self.left, self.right, strict=True)]
         return np.stack(channels, axis=-1) if len(channels) > 1 else channels[0][..., None]
 
-    def columns(self, ids: Rows) -> NDArray[np.float32]:
+    def columns(self, ids: Ids) -> Floats:
         return np.stack([a @ b[:, ids] for a, b in zip(self.left, self.right, strict=True)], axis=-1)
 
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        if len(self.left) == 1:
-            return self.left[0] @ (self.right[0] @ lighting)
-        channels = zip(self.left, self.right, lighting.T, strict=True)
-        return np.stack([a @ (b @ light) for a, b, light in channels], axis=-1)
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
+        pairs = list(zip(self.left, self.right, strict=True))
+        return np.concatenate(
+            [
+                np.stack([np.einsum("mr,rm->m", a[ids[s]], b[:, texels[s]]) for a, b in pairs], axis=1)
+                for s in blocks
+            ]
+        )
 
-    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.stack([a @ (b @ vectors) for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+    def _apply_same(self, x: Floats) -> Floats:
+        return np.stack([a @ (b @ x) for a, b in zip(self.left, self.right, strict=True)], axis=1)
 
-    def reordered(self, source: Rows) -> LowRank:
-        return replace(self, left=tuple(left[source] for left in self.left))
+    def _apply_each(self, x: Floats) -> Floats:
+        channels = zip(self.left, self.right, np.moveaxis(x, 1, 0), strict=True)
+        return np.stack([a @ (b @ light) for a, b, light in channels], axis=1)
+
+    def _adjoint_same(self, y: Floats) -> Floats:
+        return np.stack([b.T @ (a.T @ y) for a, b in zip(self.left, self.right, strict=True)], axis=1)
+
+    def _adjoint_each(self, y: Floats) -> Floats:
+        channels = zip(self.left, self.right, np.moveaxis(y, 1, 0), strict=True)
+        return np.stack([b.T @ (a.T @ weights) for a, b, weights in channels], axis=1)
+
+    def take(self, ids: Ids) -> LowRank:
+        return replace(self, left=tuple(left[ids] for left in self.left))
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        sides = (("left", self.left), ("right", self.right))
+        return {f"{name}_{c}": factor for name, factors in sides for c, factor in enumerate(factors)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        left, right = (
+            [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
+        )
+        pairs = list(zip(left, right, strict=True))
+        if (
+            len(left) not in (1, 3)
+            or any(a.shape != (len(left[0]), len(b)) for a, b in pairs)
+            or any(b.shape[1] != lighting.n_directions for b in right)
+        ):
+            raise ValueError("factors of the indirect light do not fit together")
+        return cls(tuple(left), tuple(right))

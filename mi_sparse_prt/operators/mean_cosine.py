@@ -3,49 +3,85 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.bits import Bits, unpack
 from mi_sparse_prt.core.block_products import in_blocks
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Rows
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 FIXED_POINT = 65535.0  # mean cosines in [0, 1] as 16-bit fixed point: an absolute error of 8e-6
 
 
 @dataclass(frozen=True)
-class MeanCosine:
-    """Direct light in the texel basis, by brute force: the mean of V max(0, n . w) over each texel.
+class MeanCosine(Operator):
+    """Unit-albedo direct transport, the mean cosine of each texel times ``d_omega / pi``.
 
     Attributes
     ----------
-    fixed : (n_v, n_directions) uint16
+    fixed : (n, n_directions) uint16
         The mean as 16-bit fixed point, 65535 = 1.
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "mean_cosine"
     fixed: NDArray[np.uint16]
     lighting: CubemapLighting
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.fixed), self.lighting.n_directions, 1
 
     @property
     def nbytes(self) -> int:
         return self.fixed.nbytes
 
-    def rows(self, ids: Rows) -> NDArray[np.float32]:
+    def rows(self, ids: Ids) -> Floats:
         return (self.fixed[ids] * self._weights())[..., None]
 
-    def columns(self, ids: Rows) -> NDArray[np.float32]:
+    def columns(self, ids: Ids) -> Floats:
         return (self.fixed[:, ids] * self._weights()[ids])[..., None]
 
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        return in_blocks(self.fixed, lighting * self._weights()[:, None])
+    def dense_columns(self, texels: Ids, out: Floats) -> Floats:
+        power = self.lighting.solid_angles[texels] / np.float32(np.pi)
+        _convert(self.fixed, np.asarray(texels, np.int64), power / np.float32(FIXED_POINT), out)
+        return out
 
-    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return in_blocks(self.fixed, vectors * self._weights()[:, None])[..., None]
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        return (self.fixed[ids, texels] * self._weights()[texels])[:, None]
 
-    def reordered(self, source: Rows) -> MeanCosine:
-        return replace(self, fixed=self.fixed[source])
+    def _apply_same(self, x: Floats) -> Floats:
+        return in_blocks(self.fixed, x * self._weights()[:, None])[:, None]
 
-    def _weights(self) -> NDArray[np.float32]:
+    def masked(self, points: NDArray[np.int64], open: Bits) -> MeanCosine:
+        fixed = self.fixed.copy()
+        fixed[points] *= unpack(open, fixed.shape[1])
+        return replace(self, fixed=fixed)
+
+    def take(self, ids: Ids) -> MeanCosine:
+        return replace(self, fixed=self.fixed[ids])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {"mean_cosine": self.fixed}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        fixed = arrays["mean_cosine"]
+        if fixed.shape[1:] != (lighting.n_directions,):
+            raise ValueError(f"mean cosines {fixed.shape} do not fit the lighting")
+        return cls(fixed, lighting)
+
+    def _weights(self) -> Floats:
         return self.lighting.solid_angles / np.float32(np.pi * FIXED_POINT)
+
+
+@numba.njit(parallel=True, cache=True)
+def _convert(fixed: NDArray[np.uint16], texels: NDArray[np.int64], units: Floats, result: Floats) -> None:
+    """Elements (n, m): multiples of the units (m,)."""
+    for i in numba.prange(len(fixed)):
+        for j in range(len(texels)):
+            result[i, j] = np.float32(fixed[i, texels[j]]) * units[j]

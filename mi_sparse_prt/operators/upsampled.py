@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy.sparse
@@ -10,36 +11,45 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.block_products import in_blocks
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Rows
+from mi_sparse_prt.operators.interpolated import row_entries, summed_entries
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_to_arrays
+
+_ELEMENTS = 1 << 15  # at a time; each has four coarse ones
 
 
 @dataclass(frozen=True)
-class Upsampled:
-    """Interreflected light: white transport per solid angle, at the lighting's directions or at fewer.
+class Upsampled(Operator):
+    """Unit-albedo transport per solid angle, at the lighting's directions or at fewer.
 
     Attributes
     ----------
-    density : (n_v, n_coarse, channels) float16, 1/sr
+    density : (n, n_coarse, channels) float16, 1/sr
         channels is 1 in a grey scene.
     upsampling : (n_directions, n_coarse) sparse, rows sum to 1
         Interpolates a coarse cubemap at the lighting's directions; the identity where none is coarser.
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "upsampled"
     density: NDArray[np.float16]
     upsampling: scipy.sparse.csr_array
     lighting: CubemapLighting
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.density), self.lighting.n_directions, self.density.shape[2]
+
+    @property
     def nbytes(self) -> int:
         return self.density.nbytes
 
-    def rows(self, ids: Rows) -> NDArray[np.float32]:
+    def rows(self, ids: Ids) -> Floats:
         density = self.density[ids].astype(np.float32)  # [row, coarse, channel]
         fine = np.stack([(self.upsampling @ density[..., c].T).T for c in range(density.shape[2])], axis=-1)
         return fine * self.lighting.solid_angles[:, None]
 
-    def columns(self, ids: Rows) -> NDArray[np.float32]:
+    def columns(self, ids: Ids) -> Floats:
         weights = self.upsampling[np.asarray(ids)].multiply(self.lighting.solid_angles[ids][:, None]).tocsr()
         needed = np.unique(weights.indices)
         density = self.density[:, needed].astype(np.float32)  # [vertex, needed coarse, channel]
@@ -47,17 +57,36 @@ class Upsampled:
             [(weights[:, needed] @ density[..., c].T).T for c in range(density.shape[2])], axis=-1
         )
 
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        coarse = self.upsampling.T @ (lighting * self.lighting.solid_angles[:, None])  # [coarse, rgb]
-        if self.density.shape[2] == 1:
-            return in_blocks(self.density[..., 0], coarse)
-        channels = [in_blocks(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
-        return np.concatenate(channels, axis=1)
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
+        return np.concatenate([self._elements(ids[b], texels[b]) for b in blocks])
 
-    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        coarse = self.upsampling.T @ (vectors * self.lighting.solid_angles[:, None])  # [coarse, vector]
+    def _elements(self, ids: Ids, texels: Ids) -> Floats:
+        element, coarse, weights = row_entries(self.upsampling, texels)
+        density = self.density[ids[element], coarse].astype(np.float32)  # [entry, channel]
+        fine = summed_entries(element, weights, density, len(ids))
+        return fine * self.lighting.solid_angles[texels][:, None]
+
+    def _apply_same(self, x: Floats) -> Floats:
+        coarse = self.upsampling.T @ (x * self.lighting.solid_angles[:, None])  # [coarse, vector]
         channels = [in_blocks(self.density[..., c], coarse) for c in range(self.density.shape[2])]
-        return np.stack(channels, axis=-1)
+        return np.stack(channels, axis=1)
 
-    def reordered(self, source: Rows) -> Upsampled:
-        return replace(self, density=self.density[source])
+    def _apply_each(self, x: Floats) -> Floats:
+        light = x * self.lighting.solid_angles[:, None, None]
+        coarse = [self.upsampling.T @ light[:, c] for c in range(3)]  # of [coarse, vector]
+        return np.stack([in_blocks(self.density[..., c], coarse[c]) for c in range(3)], axis=1)
+
+    def take(self, ids: Ids) -> Upsampled:
+        return replace(self, density=self.density[ids])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {"density": self.density, **sparse_to_arrays("upsampling", self.upsampling)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        density = arrays["density"]
+        upsampling = sparse_from_arrays("upsampling", arrays, density.shape[1])
+        if upsampling.shape[0] != lighting.n_directions or density.shape[2] not in (1, 3):
+            raise ValueError("indirect light does not fit the lighting")
+        return cls(density, upsampling, lighting)

@@ -3,49 +3,73 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.bits import BITS, Bits, bits_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Rows
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
 @dataclass(frozen=True)
-class Visibility:
-    """Direct light in the direction basis: one bit per element, cosine and solid angle analytic.
+class Visibility(Operator):
+    """Unit-albedo direct transport ``V max(0, n . w) d_omega / pi``.
 
     Attributes
     ----------
-    bits : (n_v, n_directions / 32) uint32
+    bits : (n, ceil(n_directions / 32)) uint32
         Bit j % 32 of word j // 32: whether texel j's centre is seen (never below the horizon).
-    normals : (n_v, 3) float32, world
+    normals : (n, 3) float32, world
     lighting : CubemapLighting
     """
 
+    kind: ClassVar[str] = "visibility"
+    dark_below_horizon: ClassVar[bool] = True
     bits: NDArray[np.uint32]
     normals: NDArray[np.float32]
     lighting: CubemapLighting
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.bits), self.lighting.n_directions, 1
+
+    @property
     def nbytes(self) -> int:
         return self.bits.nbytes
 
-    def rows(self, ids: Rows) -> NDArray[np.float32]:
+    @property
+    def listed(self) -> tuple[NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
+        """Texels that are seen in part, as ``FractionalVisibility`` lists them: none."""
+        return np.zeros(len(self.bits) + 1, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+
+    @property
+    def edges(self) -> Bits | None:
+        return self.bits
+
+    def rows(self, ids: Ids) -> Floats:
         beams = np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
-        return _expanded_bits(self.bits, self.normals, np.asarray(ids, np.int64), beams)[..., None]
+        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), beams)[..., None]
 
-    def columns(self, ids: Rows) -> NDArray[np.float32]:
-        ids = np.asarray(ids)
-        words = self.bits[:, ids // BITS]  # [vertex, column]
-        seen = (words >> (ids % BITS).astype(np.uint32)) & 1
-        cosine = np.maximum(self.normals @ self.lighting.directions[ids].T, 0)
-        return (cosine * seen * self._weights()[ids])[..., None].astype(np.float32)
+    def columns(self, ids: Ids) -> Floats:
+        return self.dense_columns(ids, np.empty((len(self.bits), len(ids)), np.float32))[..., None]
 
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
+    def dense_columns(self, texels: Ids, out: Floats) -> Floats:
+        texels = np.asarray(texels)
+        words, shifts = (np.asarray(f(texels, BITS), np.uint32) for f in (np.floor_divide, np.mod))
+        beams = np.ascontiguousarray((self.lighting.directions[texels] * self._weights()[texels, None]).T)
+        _expand_columns(self.bits, self.normals, words, shifts, beams, out)
+        return out
+
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        seen = bits_at(self.bits, ids, texels)
+        cosine = np.einsum("md,md->m", self.normals[ids], self.lighting.directions[texels])
+        weights = self.lighting.solid_angles[texels] / np.float32(np.pi)
+        return (np.maximum(cosine, 0) * seen * weights).astype(np.float32)[:, None]
+
+    def relight(self, lighting: Floats) -> Floats:
         n_padded = self.bits.shape[1] * BITS
         directions = np.zeros((3, n_padded), dtype=np.float32)
         power = np.zeros((3, n_padded), dtype=np.float32)
@@ -53,20 +77,46 @@ class Visibility:
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
         return _relight_bits(self.bits, self.normals, directions, power)
 
-    def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return rows_times(self.rows, len(self.bits), vectors)
+    def masked(self, points: NDArray[np.int64], open: Bits) -> Visibility:
+        bits = self.bits.copy()
+        bits[points] &= open
+        return replace(self, bits=bits)
 
-    def reordered(self, source: Rows) -> Visibility:
-        return replace(self, bits=self.bits[source], normals=self.normals[source])
+    def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
+        texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
+        power = self._weights()[texels]
+        beams = np.moveaxis(self.lighting.directions[texels], 2, 1) * power[:, None]  # [word, xyz, bit]
+        return _combine(
+            self.bits, self.normals, np.asarray(words, np.int64), np.ascontiguousarray(beams), signs
+        )
 
-    def _weights(self) -> NDArray[np.float32]:
+    def take(self, ids: Ids) -> Visibility:
+        return replace(self, bits=self.bits[ids], normals=self.normals[ids])
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        return {"visibility": self.bits, "normals": self.normals}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        bits, normals = arrays["visibility"], arrays["normals"]
+        check_bits(bits, normals, lighting)
+        return cls(bits, normals, lighting)
+
+    def _weights(self) -> Floats:
         return self.lighting.solid_angles / np.float32(np.pi)
 
 
+def check_bits(bits: Bits, normals: Floats, lighting: CubemapLighting) -> None:
+    """Raise ValueError unless bits and normals are of the same points, and bits of this lighting."""
+    words = -(-lighting.n_directions // BITS)
+    if bits.shape[1:] != (words,) or normals.shape != (len(bits), 3):
+        raise ValueError(f"visibility {bits.shape} and normals {normals.shape} do not fit together")
+
+
 @numba.njit(parallel=True, cache=True)
-def _expanded_bits(
-    bits: NDArray[np.uint32], normals: NDArray[np.float32], ids: NDArray[np.int64], beams: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _expanded_rows(
+    bits: NDArray[np.uint32], normals: Floats, ids: NDArray[np.int64], beams: Floats
+) -> Floats:
     """Elements (n, m) of rows ``ids``; beams (3, m) are directions times power."""
     result = np.zeros((len(ids), beams.shape[1]), np.float32)
     for i in numba.prange(len(ids)):
@@ -83,12 +133,7 @@ def _expanded_bits(
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _relight_bits(
-    bits: NDArray[np.uint32],
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    power: NDArray[np.float32],
-) -> NDArray[np.float32]:
+def _relight_bits(bits: NDArray[np.uint32], normals: Floats, directions: Floats, power: Floats) -> Floats:
     """Sum of power[:, j] * max(0, n_i . w_j) over the set bits j of row i; the inner loop is one word of bits."""
     radiance = np.zeros((bits.shape[0], 3), dtype=np.float32)
     for i in numba.prange(bits.shape[0]):
@@ -107,3 +152,40 @@ def _relight_bits(
                 blue += seen * power[2, j]
         radiance[i, 0], radiance[i, 1], radiance[i, 2] = red, green, blue
     return radiance
+
+
+@numba.njit(parallel=True, cache=True)
+def _expand_columns(
+    bits: NDArray[np.uint32],
+    normals: Floats,
+    words: NDArray[np.uint32],
+    shifts: NDArray[np.uint32],
+    beams: Floats,
+    result: Floats,
+) -> None:
+    """Elements (n, m) at bits ``shifts`` of ``words``; beams (3, m) are directions times power."""
+    for i in numba.prange(len(bits)):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        for j in range(len(words)):
+            light = nx * beams[0, j] + ny * beams[1, j] + nz * beams[2, j]
+            seen = (bits[i, words[j]] >> shifts[j]) & np.uint32(1)
+            result[i, j] = max(light, np.float32(0)) * np.float32(seen)
+
+
+@numba.njit(parallel=True, fastmath={"contract"}, cache=True)
+def _combine(
+    bits: NDArray[np.uint32], normals: Floats, words: NDArray[np.int64], beams: Floats, signs: Floats
+) -> Floats:
+    """Sums (n, k) over words of the elements at their bits, with signs (words, k); beams (words, 3, k)."""
+    result = np.zeros((len(bits), signs.shape[1]), np.float32)
+    for i in numba.prange(len(bits)):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        for g in range(len(words)):
+            mask = bits[i, words[g]]
+            if mask == 0:
+                continue
+            for k in range(signs.shape[1]):
+                light = nx * beams[g, 0, k] + ny * beams[g, 1, k] + nz * beams[g, 2, k]
+                seen = signs[g, k] * np.float32((mask >> np.uint32(k)) & np.uint32(1))
+                result[i, k] += max(light, np.float32(0)) * seen
+    return result

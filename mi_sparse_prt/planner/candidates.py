@@ -143,7 +143,9 @@ class Ranking:
 
 def ladder(settings: Settings) -> Ladder:
     """The plan of a method; with a target error, from the coarsest of its plans on."""
-    assert settings.plan is not None
+    if settings.plan is None:  # "auto" with terms of glossy surfaces, whose costs no pilot knows
+        direct = "exact" if settings.basis == "direction" else "edges"
+        return Ladder([replace(plan, direct=direct) for plan in EFFORTS["gather"]])
     if settings.target_error is None or isinstance(settings.method, Plan):
         return Ladder([settings.plan])
     return Ladder(EFFORTS.get(settings.method, (settings.plan,)))

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from mi_sparse_prt.core.bits import Bits, counts, listed, unpack
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.operators.single_elements import elements
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
@@ -56,7 +55,7 @@ def edges_cost(scene: Scene, direct: DirectSolver, held: PilotElements) -> Direc
     start = time.perf_counter()
     fractional_visibility(some, bits)
     edges = (time.perf_counter() - start) * len(direct.points) / len(places)
-    ours = elements(part, np.repeat(places, held.texels.shape[1]), held.texels.ravel())
+    ours = part.elements(np.repeat(places, held.texels.shape[1]), held.texels.ravel())
     square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
     return DirectCost(centres + edges, math.sqrt(max(square, 0.0)))
 

@@ -11,8 +11,8 @@ from mi_sparse_prt.methods.execution import indirect_solver
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.row_timing import seconds_per_row
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import Problem
 
 
 class _Share(NamedTuple):
@@ -41,7 +41,7 @@ _INDIRECT = {
 
 
 def forecast(
-    scene: Scene,
+    problem: Problem,
     direct: DirectSolver,
     settings: Settings,
     plan: Plan,
@@ -52,7 +52,7 @@ def forecast(
 
     Parameters
     ----------
-    scene : Scene
+    problem : Problem
     direct : DirectSolver
         At all vertices.
     settings : Settings
@@ -70,7 +70,7 @@ def forecast(
         If there is not enough memory.
     """
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
-    paths = indirect_solver(scene, settings.of(plan))
+    paths = indirect_solver(problem, settings.of(plan))
     elements = paths.lighting.n_directions * paths.channels
     per_vertex = light.bytes * direct.row_storage(1).nbytes + more.bytes * 2 * elements
     needed, available = len(direct.points) * per_vertex, psutil.virtual_memory().available

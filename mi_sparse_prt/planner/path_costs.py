@@ -15,8 +15,8 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.execution import indirect_solver
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.row_timing import seconds_per_row
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 
 PILOT_PATHS = 6144  # per vertex
 PILOT_SPP = 16  # where rows are timed
@@ -54,13 +54,13 @@ class PathCosts:
 
 
 def path_costs(
-    scene: Scene, settings: Settings, held: PilotElements, path: float, resolutions: Iterable[int]
+    problem: Problem, settings: Settings, held: PilotElements, path: float, resolutions: Iterable[int]
 ) -> PathCosts:
     """Measure rows of some resolutions at the vertices of the held-out elements.
 
     Parameters
     ----------
-    scene : Scene
+    problem : Problem
     settings : Settings
     held : PilotElements
         With indirect light.
@@ -76,7 +76,7 @@ def path_costs(
             bias[resolution], noise[resolution] = 0.0, noise_of_a_path(held)
             continue
         spp = max(2, PILOT_PATHS // (6 * resolution**2))
-        solver = indirect_solver(scene, replace(settings, spp=spp, indirect_resolution=resolution))
+        solver = indirect_solver(problem, replace(settings, spp=spp, indirect_resolution=resolution))
         mean, variance = _interpolated(solver, lighting, held)
         power = lighting.solid_angles[held.texels][..., None]
         own = held.weighted(variance * power**2)
@@ -92,10 +92,12 @@ def coarse_resolutions(finest: int) -> list[int]:
     return [2**k for k in range(COARSEST.bit_length() - 1, finest.bit_length() - 1)]
 
 
-def seconds_of_a_path(scene: Scene, settings: Settings, lighting: CubemapLighting) -> float:
+def seconds_of_a_path(problem: Problem, settings: Settings, lighting: CubemapLighting) -> float:
     """Seconds of one path for every element of the matrix."""
-    solver = indirect_solver(scene, replace(settings, spp=PILOT_SPP, indirect_resolution=lighting.resolution))
-    return seconds_per_row(solver) * len(scene.positions) / PILOT_SPP
+    solver = indirect_solver(
+        problem, replace(settings, spp=PILOT_SPP, indirect_resolution=lighting.resolution)
+    )
+    return seconds_per_row(solver) * len(problem.points) / PILOT_SPP
 
 
 def noise_of_a_path(held: PilotElements) -> float:

@@ -18,8 +18,8 @@ from mi_sparse_prt.planner.path_costs import (
 )
 from mi_sparse_prt.planner.radiosity_costs import gather_costs
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import Problem
 
 VERTICES = 192  # of a pilot, in all meshes together
 LEAST_VERTICES = 16  # of each
@@ -29,12 +29,12 @@ LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samp
 DRAWN = 0.6e-6  # seconds per element of a check that is drawn for direct light
 
 
-def measure(scene: Scene, direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
+def measure(problem: Problem, direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     """Measure the costs of all plans that settings leave open.
 
     Parameters
     ----------
-    scene : Scene
+    problem : Problem
     direct : DirectSolver
         At all vertices.
     settings : Settings
@@ -47,6 +47,7 @@ def measure(scene: Scene, direct: DirectSolver, settings: Settings, indirect: bo
     Costs
         ``fixed`` is that of held-out elements.
     """
+    scene = problem.scene
     count = max(LEAST_VERTICES, VERTICES // len(scene.meshes))
     seed, lighting = settings.seed + SEEDS, direct.lighting
     held = PilotElements(scene, lighting, settings.basis, settings.max_depth, indirect, seed, count, TEXELS)
@@ -62,9 +63,9 @@ def measure(scene: Scene, direct: DirectSolver, settings: Settings, indirect: bo
         costs = replace(costs, fixed=(1 + held_out.ROUND) * check, check=check)
     if not indirect:
         return costs
-    path = seconds_of_a_path(scene, settings, lighting)
+    path = seconds_of_a_path(problem, settings, lighting)
     fine, asked = lighting.resolution, settings.indirect_resolution
-    costs = replace(costs, paths=path_costs(scene, settings, held, path, [asked or fine]))
+    costs = replace(costs, paths=path_costs(problem, settings, held, path, [asked or fine]))
     if auto:
         costs = replace(costs, gather=gather_costs(scene, direct, held, seed))
     if auto and settings.basis == "direction" and asked in (None, fine):
@@ -72,7 +73,7 @@ def measure(scene: Scene, direct: DirectSolver, settings: Settings, indirect: bo
         costs = replace(costs, sparse=sparse)
     if asked is None and not (auto and _too_dear(costs, settings, path, noise_of_a_path(held))):
         every = [*coarse_resolutions(fine), fine]
-        costs = replace(costs, paths=path_costs(scene, settings, held, path, every))
+        costs = replace(costs, paths=path_costs(problem, settings, held, path, every))
     return costs
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mi_sparse_prt.cache import cached_glossy, cached_precompute
+from mi_sparse_prt.cache import cached_precompute
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.methods.settings import Settings
@@ -50,7 +50,7 @@ class SparsePRT(mi.SamplingIntegrator):
     target_error        float      Relative L2 error of the matrix to aim at. (0: that of ``prt.precompute``)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               integer    Of in-out factors: BSDFs that are not diffuse are then shaded for the view, per
-                                   pixel, by finite elements in the direction basis. (0: they count as diffuse)
+                                   pixel. (0: they count as diffuse)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
@@ -74,9 +74,9 @@ class SparsePRT(mi.SamplingIntegrator):
             "target_error": props.get("target_error", 0.0) or None,
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),
+            "terms": props.get("terms", 0),
         }
         Settings(self._lighting.resolution, **self._settings)  # complains now, not when rendering
-        self._terms = props.get("terms", 0)
         self._edge_length = props.get("edge_length", 0.0) or None
         cache = props.get("cache", "")
         self._cache = Path(cache) if cache else None
@@ -121,11 +121,9 @@ class SparsePRT(mi.SamplingIntegrator):
         return RelitIntegrator(relit).render(scene, sensor, seed, spp, develop, evaluate)
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter) -> RelitScene:
-        if self._terms > 0:
-            chosen = {name: self._settings[name] for name in ("max_depth", "seed")} | {"terms": self._terms}
-            glossy = cached_glossy(surfaces, self._lighting, self._cache, self._progress, **chosen)
-            return GlossyRelitScene(surfaces, glossy, environment, environment)
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
+        if transport.terms:
+            return GlossyRelitScene(surfaces, transport, environment, environment)
         return RelitScene(surfaces, transport.irradiance(environment), environment)
 
     def to_string(self) -> str:

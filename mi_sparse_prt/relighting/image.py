@@ -13,8 +13,8 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.reflection.factor_tables import looked_up, outgoing_tables
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -96,7 +96,8 @@ class GlossyRelitScene(RelitScene):
     Parameters
     ----------
     scene : Scene
-    transport : GlossyTransport
+    transport : LightTransport
+        With terms.
     environment : Environment or (n_directions, 3) float
     background : mi.Emitter or None
 
@@ -107,24 +108,25 @@ class GlossyRelitScene(RelitScene):
     """
 
     def __init__(
-        self, scene: Scene, transport: GlossyTransport, environment: Any, background: mi.Emitter | None
+        self, scene: Scene, transport: LightTransport, environment: Any, background: mi.Emitter | None
     ) -> None:
         transport = transport.for_scene(scene)
-        found = transport.coefficients(environment)
+        found, surfaces = transport.coefficients(environment), transport.reflection
+        assert isinstance(surfaces, InOutFactors)
         super().__init__(scene, found.white, background)
-        self._diffuse = mi.Color3f(np.ascontiguousarray(transport.albedo.T))
+        self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
-        self._tangents = mi.Vector3f(np.ascontiguousarray(transport.tangents.T))
-        self._material = mi.UInt32(np.maximum(transport.material, 0).astype(np.uint32))
-        self._glossy = mi.Bool(transport.material >= 0)
-        tables = outgoing_tables(transport.factors)
+        self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
+        self._material = mi.UInt32(np.maximum(surfaces.material, 0).astype(np.uint32))
+        self._glossy = mi.Bool(surfaces.material >= 0)
+        tables = outgoing_tables(surfaces.factors)
         self._size = tables.shape[1]
         first = {
-            number: own.bsdf for number, own in zip(_numbers(scene, transport), scene.materials, strict=True)
+            number: own.bsdf for number, own in zip(_numbers(scene, surfaces), scene.materials, strict=True)
         }
         self._textures = {
             number: VaryingDiffuse(first[number])
-            for number, factors in enumerate(transport.factors)
+            for number, factors in enumerate(surfaces.factors)
             if factors.varying_diffuse
         }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
@@ -155,9 +157,9 @@ class GlossyRelitScene(RelitScene):
         return total
 
 
-def _numbers(scene: Scene, transport: GlossyTransport) -> list[int]:
+def _numbers(scene: Scene, surfaces: InOutFactors) -> list[int]:
     """Of each mesh's BRDF, -1 if it is diffuse."""
-    return [int(transport.material[mesh.vertices.start]) for mesh in scene.meshes]
+    return [int(surfaces.material[mesh.vertices.start]) for mesh in scene.meshes]
 
 
 class RelitIntegrator(mi.SamplingIntegrator):
@@ -181,7 +183,7 @@ class RelitIntegrator(mi.SamplingIntegrator):
 
 def render(
     scene: Scene,
-    transport: LightTransport | GlossyTransport,
+    transport: LightTransport,
     environment: Environment | mi.Emitter | ArrayLike,
     sensor: int | mi.Sensor = 0,
     spp: int = 64,
@@ -194,7 +196,7 @@ def render(
     ----------
     scene : Scene
         The scene of the matrix.
-    transport : LightTransport or GlossyTransport
+    transport : LightTransport
     environment : Environment, emitter or (n_directions, 3) float
         The light; also the background.
     sensor : int or mi.Sensor
@@ -222,7 +224,7 @@ def render(
             )
         sensor = sensors[sensor]
     background = background_emitter(environment, transport.lighting)
-    if isinstance(transport, GlossyTransport):
+    if transport.terms:
         relit: RelitScene = GlossyRelitScene(scene, transport, environment, background)
     else:
         relit = RelitScene(scene, transport.for_scene(scene).irradiance(environment), background)

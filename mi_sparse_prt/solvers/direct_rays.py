@@ -6,6 +6,9 @@ and the solid angle are analytic), a 16-bit mean cosine in the texel basis.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,6 +21,8 @@ from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.mean_cosine import FIXED_POINT
+
+Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
 
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
 
@@ -84,7 +89,8 @@ class DirectSolver:
         element, stratum = self._lanes(n * self._n_texels)
         row = element // self._n_texels
         texel = element - row * self._n_texels
-        mean = self._mean_cosine(dr.gather(mi.UInt32, ids, row), texel, stratum, self.seed)
+        point = dr.gather(mi.UInt32, ids, row)
+        mean = self._means(point, texel, stratum, lambda *_: [mi.Float(1)], self.seed)[0]
         return mi.UInt32(mean * FIXED_POINT + 0.5).numpy().astype(np.uint16).reshape(n, -1)
 
     def elements(
@@ -112,11 +118,7 @@ class DirectSolver:
                 visible, cos = self.trace(points, self._texels.centre(texels), mi.Mask(True))
                 cosine[part] = dr.select(visible, cos, 0).numpy()
             else:
-                element, stratum = self._lanes(len(texels))
-                point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
-                cosine[part] = self._mean_cosine(
-                    point, texel, stratum, self.seed if seed is None else seed
-                ).numpy()
+                cosine[part] = self.weighted_means(points, texels, lambda *_: [mi.Float(1)], seed)[0].numpy()
         return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
 
     def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -153,17 +155,42 @@ class DirectSolver:
         ray = start_ray(self._points, point, direction)
         return active & ~self.scene.ray_test(ray, active=active), cosine
 
-    def _mean_cosine(self, point: mi.UInt32, texel: mi.UInt32, stratum: mi.UInt32, seed: int) -> mi.Float:
-        """Mean of V max(0, n.w) over each texel, lanes being its strata; one value per element.
+    def weighted_means(
+        self, points: mi.UInt32, texels: mi.UInt32, weights: Weights, seed: int | None = None
+    ) -> list[mi.Float]:
+        """Means of V max(0, n.w) times some weights, one value per listed element and weight.
 
-        Weights are the solid angles of the samples over their sum, so that the mean never leaves [0, 1].
+        Parameters
+        ----------
+        points, texels : UInt32
+        weights : callable
+            Of points and directions (unit, world).
+        seed : int, optional
+        """
+        if self.basis == "direction":
+            direction = self._texels.centre(texels)
+            visible, cosine = self.trace(points, direction, mi.Mask(True))
+            return [dr.select(visible, cosine * weight, 0) for weight in weights(points, direction)]
+        element, stratum = self._lanes(len(texels))
+        point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+        return self._means(point, texel, stratum, weights, self.seed if seed is None else seed)
+
+    def _means(
+        self, point: mi.UInt32, texel: mi.UInt32, stratum: mi.UInt32, weights: Weights, seed: int
+    ) -> list[mi.Float]:
+        """Over each texel, lanes being its strata; one value per element and weight.
+
+        Samples weigh by their solid angles over the sum of these, so that a mean cosine never leaves [0, 1].
         """
         rng = random_generator(self._points.key(point), texel, stratum, seed)
         row = stratum // self.strata
         u = (mi.Float(stratum - row * self.strata) + rng.next_float32()) / self.strata
         v = (mi.Float(row) + rng.next_float32()) / self.strata
-        direction, weight = self._texels.inside(texel, u, v)
+        direction, area = self._texels.inside(texel, u, v)
         visible, cosine = self.trace(point, direction, mi.Mask(True))
-        seen = dr.select(visible, cosine * weight, 0)
-        total = dr.block_reduce(dr.ReduceOp.Add, weight, self.rays_per_element)
-        return dr.block_reduce(dr.ReduceOp.Add, seen, self.rays_per_element) / total
+        seen = dr.select(visible, cosine * area, 0)
+        total = dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)
+        return [
+            dr.block_reduce(dr.ReduceOp.Add, seen * weight, self.rays_per_element) / total
+            for weight in weights(point, direction)
+        ]

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import gathered, product
-from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.direct_columns import DirectColumns
-from mi_sparse_prt.operators.operator import Part
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
+from mi_sparse_prt.operators.operator import Operator
 
 DRAWS = 3  # of up to 32 combinations of columns each, that join the basis together
 MIXED = 24  # columns in a combination
@@ -58,8 +57,7 @@ class FirstBounce:
 def first_bounce(
     matrix: scipy.sparse.csr_array,
     albedo: Floats,
-    direct: Part,
-    lighting: CubemapLighting,
+    direct: Operator,
     keys: NDArray[np.uint64],
     tolerance: float,
     seed: int,
@@ -71,9 +69,8 @@ def first_bounce(
     matrix : (n, n_v) sparse float32
         G.
     albedo : (channels, n_v) float32
-    direct : Part
+    direct : Operator
         D.
-    lighting : CubemapLighting
     keys : (n,) uint64
         Of the rows of G: random numbers are made of them.
     tolerance : float
@@ -86,20 +83,20 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrix, albedo, DirectColumns(direct, lighting), hashes, rng, tolerance)
+    columns, turn, missed = _basis(matrix, albedo, direct, hashes, rng, tolerance)
     count = _row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, rng), hashes, count)
     some = columns[rows].astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
-    right = [fit @ known for known in _rows(matrix[rows], albedo, direct, lighting)]
+    right = [fit @ known for known in _rows(matrix[rows], albedo, direct)]
     return _truncated(columns, turn, right, missed, tolerance)
 
 
 def _basis(
     matrix: scipy.sparse.csr_array,
     albedo: Floats,
-    light: DirectColumns,
+    direct: Operator,
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
@@ -115,7 +112,7 @@ def _basis(
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
     while True:
-        block = _combinations(matrix, albedo, light, rng)
+        block = _combinations(matrix, albedo, direct, rng)
         new = (block if shorten is None else product(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
@@ -145,12 +142,12 @@ def _sums(hashes: NDArray[np.uint64]) -> scipy.sparse.csr_array | None:
 
 
 def _combinations(
-    matrix: scipy.sparse.csr_array, albedo: Floats, light: DirectColumns, rng: np.random.Generator
+    matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator, rng: np.random.Generator
 ) -> Floats:
     """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations)."""
     found, draws = [], max(1, DRAWS // len(albedo))
     for rho in albedo:
-        mixed = np.hstack([light.combined(MIXED, rng) for _ in range(draws)])
+        mixed = np.hstack([random_combinations(direct, MIXED, rng) for _ in range(draws)])
         found.append(gathered(matrix, rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
 
@@ -192,14 +189,14 @@ def _chosen_rows(
     return rows, -np.expm1(-rate[rows] * arrival[order[count]])
 
 
-def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Part, lighting: CubemapLighting) -> Floats:
+def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator) -> Floats:
     """G rho D (channels, s, n_directions) for some rows (s, n_v) of G, from those rows of D that they touch."""
     touched, columns = np.unique(matrix.indices, return_inverse=True)
     shape = matrix.shape[0], len(touched)
     local = scipy.sparse.csr_array((matrix.data, columns.astype(np.int32), matrix.indptr), shape=shape)
     rho = np.ascontiguousarray(albedo[:, touched])
-    result = np.empty((len(rho), shape[0], lighting.n_directions), np.float32)
-    for texels, light in DirectColumns(direct, lighting, touched).blocks(len(touched)):
+    result = np.empty((len(rho), shape[0], direct.shape[1]), np.float32)
+    for texels, light in ColumnBlocks(direct.take(touched)):
         result[:, :, texels] = gathered(local, rho, light)
     return result
 

@@ -19,21 +19,24 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.operators.direct_columns import DirectColumns
+from mi_sparse_prt.operators.column_blocks import random_combinations
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
-from mi_sparse_prt.operators.low_rank import LowRank
-from mi_sparse_prt.operators.operator import Part
-from mi_sparse_prt.reflection.factor_tables import looked_up
-from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.reflection.factor_tables import outgoing_tables
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.solvers.first_bounce import MIXED
 from mi_sparse_prt.solvers.form_factors import BEHIND, LANES, Surfaces, cosine_rays, sobol
-from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements
+from mi_sparse_prt.solvers.lobes import Lobes
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements, Gathered
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import contacts
 
 MOST_BOUNCES = 64  # where there is no limit
 NOISE_VERTICES = 4096  # at which noise is looked at
 MOST_NOISE = 0.5  # of the first bounce: a tolerance beyond would leave it out
+EVEN = 1e-6  # relative difference of channels that is none
 
 Floats = NDArray[np.float32]
 
@@ -49,42 +52,37 @@ class GlossyGather(FiniteElements):
         Of ``glossy_gather_matrix``.
     albedo : (n,) float32
         Of the diffuse part of each vertex; 1 for terms.
-    scene : Scene
-    points : Points
-        Of all vertices.
+    problem : Problem
     direct : FactoredVisibility
-    max_depth, seed : int
-        As for ``RadiositySolver``.
+    seed : int
     """
 
     def __init__(
         self,
         matrix: scipy.sparse.csr_array,
         albedo: Floats,
-        scene: Scene,
-        points: Points,
+        problem: Problem,
         direct: FactoredVisibility,
-        max_depth: int,
         seed: int,
     ) -> None:
+        points = problem.points
         term = np.tile(np.arange(1, direct.terms + 1), len(direct.glossy)).astype(np.uint64)
         keys = [points.keys, mix(np.repeat(points.keys[direct.glossy], direct.terms) + term)]
         super().__init__(
             matrix,
             albedo[None],
             np.concatenate(keys),
-            Nodes(np.arange(direct.count), None),
-            contacts(scene, direct.lighting),
-            direct.lighting,
-            max_depth,
+            Nodes(np.arange(direct.shape[0]), None),
+            contacts(problem.scene, problem.emission),
+            problem.max_depth,
             seed,
         )
 
-    def _count_for(self, direct: Part) -> int:
+    def _count_for(self, direct: Operator) -> int:
         """By the direct light of white surfaces: that of terms is dear, and joins with the first bounce."""
         assert isinstance(direct, FactoredVisibility)
-        white = direct.white.relight(np.ones((self.lighting.n_directions, 3), np.float32))[:, 0]
-        return self.bounces(np.concatenate([white, np.zeros(direct.count - len(white), np.float32)]))
+        white = direct.visibility.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0]
+        return self.bounces(np.concatenate([white, np.zeros(direct.shape[0] - len(white), np.float32)]))
 
     def bounces(self, even: Floats) -> int:
         """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
@@ -138,37 +136,29 @@ class GatherRays:
         shape = 2 * len(some), len(points)
         place = row[self.point[own]] + half * len(some), self.seen[own]
         halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
-        light = DirectColumns(direct.white, direct.lighting).combined(MIXED, np.random.default_rng(seed))
+        light = random_combinations(direct.visibility, MIXED, np.random.default_rng(seed))
         first, second = np.split(halves @ light, 2)
         norm = float(np.linalg.norm(first + second))
         return float(np.linalg.norm(first - second)) / norm if norm > 0 else 0.0
 
 
-def gather_rays(
-    scene: Scene,
-    points: Points,
-    direct: FactoredVisibility,
-    outgoing: Floats,
-    rays_per_vertex: int,
-    seed: int,
-) -> GatherRays:
+def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: int) -> GatherRays:
     """Cosine-distributed rays from all vertices.
 
     Parameters
     ----------
-    scene : Scene
-    points : Points
-        Of all vertices.
-    direct : FactoredVisibility
-        It has the frames and the incident factors.
+    problem : Problem
+        With in-out factors.
     outgoing : (channels, materials, size, size, K) float32
         g_k.
     rays_per_vertex : int
         A power of two.
     seed : int
     """
-    surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
-    lobes = Lobes(direct, outgoing)
+    assert isinstance(problem.reflection, InOutFactors)
+    points = problem.points
+    surfaces, arrays, samples = Surfaces(problem.scene), PointArrays(points), sobol(rays_per_vertex)
+    lobes = Lobes(problem.reflection, outgoing)
     size = max(1, LANES // rays_per_vertex)
     hits, into, out = [], [], []
     for a in range(0, len(points), size):
@@ -187,53 +177,9 @@ def gather_rays(
     return GatherRays(point, seen, number, np.concatenate(into), np.concatenate(out), rays_per_vertex)
 
 
-class Lobes:
-    """Factors of BRDFs on the device, looked up at vertices; 0 at those that are not glossy."""
-
-    def __init__(self, direct: FactoredVisibility, outgoing: Floats) -> None:
-        n = len(direct.bits)
-        self._size, self._terms = direct.tables.shape[1], direct.terms
-        material = np.full(n, len(direct.tables), np.uint32)  # one more, which is dark
-        material[direct.glossy] = direct.materials
-        turn = np.zeros((n, 3, 3), np.float32)
-        turn[direct.glossy] = direct.frames
-        self._material = mi.UInt32(material)
-        self._axes = [mi.Vector3f(np.ascontiguousarray(turn[:, k].T)) for k in range(3)]
-        self._incident, self._outgoing = _with_dark(direct.tables), [_with_dark(t) for t in outgoing]
-
-    def incident(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
-        """Terms f_k(w) pi / cos for directions (world) that are cosine-distributed."""
-        local = self._local(vertex, direction, mi.Mask(True))
-        scale = dr.pi / dr.maximum(local.z, 1e-2)
-        return [scale * value for value in self._looked_up(self._incident, vertex, local, mi.Mask(True))]
-
-    def outgoing(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
-        """Terms g_k(w_o) of each channel in turn; ``vertex`` may be none."""
-        valid = vertex < BEHIND
-        local = self._local(vertex, direction, valid)
-        valid &= local.z > 0
-        return [v for table in self._outgoing for v in self._looked_up(table, vertex, local, valid)]
-
-    def _local(self, vertex: mi.UInt32, direction: mi.Vector3f, valid: mi.Mask) -> mi.Vector3f:
-        return mi.Vector3f(
-            *(dr.dot(dr.gather(mi.Vector3f, axis, vertex, valid), direction) for axis in self._axes)
-        )
-
-    def _looked_up(
-        self, table: mi.Float, vertex: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
-    ) -> list[mi.Float]:
-        material = dr.gather(mi.UInt32, self._material, vertex, valid)
-        return looked_up(table, self._size, self._terms, material, local, valid)
-
-
-def _with_dark(tables: Floats) -> mi.Float:
-    dark = np.zeros_like(tables[:1])
-    return mi.Float(np.concatenate([tables, dark]).ravel())
-
-
 def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
     """G (n, n) of one channel, over white light of all vertices and terms of the glossy ones."""
-    n, terms = len(direct.bits), direct.terms
+    n, terms = len(direct.material), direct.terms
     number = np.full(n, -1)  # of a vertex among the glossy ones
     number[direct.glossy] = np.arange(len(direct.glossy))
     own = slice(channel * terms, (channel + 1) * terms)
@@ -246,7 +192,7 @@ def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) ->
     first = np.searchsorted(rays.point, np.arange(n + 1))
     into, out = rays.into / np.float32(rays.per_vertex), np.ascontiguousarray(rays.out[:, own])
     _fill(first, rays.seen, number, into, out, starts, columns, values)
-    return scipy.sparse.csr_array((values, columns, starts), shape=(direct.count, direct.count))
+    return scipy.sparse.csr_array((values, columns, starts), shape=(direct.shape[0], direct.shape[0]))
 
 
 @numba.njit(parallel=True, cache=True)
@@ -277,34 +223,42 @@ def _fill(
 
 
 def glossy_indirect(
-    scene: Scene,
-    points: Points,
-    direct: FactoredVisibility,
-    outgoing: Floats,
-    albedo: Floats,
-    rays_per_vertex: int,
-    tolerance: float,
-    max_depth: int,
-    seed: int,
-) -> tuple[LowRank, float]:
+    problem: Problem, direct: FactoredVisibility, rays_per_vertex: int, tolerance: float, seed: int
+) -> tuple[Gathered, float]:
     """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
     Parameters
     ----------
-    scene, points, direct, outgoing, rays_per_vertex, seed
-        As for ``gather_rays``.
-    albedo : (n_v, channels) float32
-        Of the diffuse part of each vertex.
+    problem : Problem
+        Its reflection has the factors of ``direct``.
+    direct : FactoredVisibility
+    rays_per_vertex : int
+        A power of two.
     tolerance : float
         As for ``RadiositySolver.indirect``; no less than the noise of the rays, whose rank is full.
-    max_depth : int
+    seed : int
     """
-    ones = np.ones(direct.count - len(albedo), np.float32)
-    rays = gather_rays(scene, points, direct, outgoing, rays_per_vertex, seed)
-    noise = rays.noise(direct, albedo.mean(axis=1), points, seed)
+    albedo, outgoing = _channels(problem.reflection)
+    ones = np.ones(direct.shape[0] - len(albedo), np.float32)
+    rays = gather_rays(problem, outgoing, rays_per_vertex, seed)
+    noise = rays.noise(direct, albedo.mean(axis=1), problem.points, seed)
     found = []
     for channel, shade in enumerate(albedo.T):
         matrix = gather_matrix(direct, rays, channel)
-        solver = GlossyGather(matrix, np.concatenate([shade, ones]), scene, points, direct, max_depth, seed)
+        solver = GlossyGather(matrix, np.concatenate([shade, ones]), problem, direct, seed)
         found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE))))
-    return LowRank(tuple(f.left[0] for f in found), tuple(f.right[0] for f in found)), noise
+    return Gathered(
+        tuple(f.left[0] for f in found),
+        tuple(f.right[0] for f in found),
+        max(f.left_out for f in found),
+        max(f.bounces for f in found),
+    ), noise
+
+
+def _channels(reflection: Reflection) -> tuple[Floats, Floats]:
+    """Albedos (n_v, channels) and g_k (channels, ...), one channel where all are alike."""
+    assert isinstance(reflection, InOutFactors)
+    albedo, outgoing = reflection.albedo, outgoing_tables(reflection.factors)
+    grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
+    count = 1 if grey else 3
+    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

@@ -24,9 +24,9 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_product import gathered, product
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.operators.direct_columns import DirectColumns
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
-from mi_sparse_prt.operators.operator import Part
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
@@ -71,7 +71,6 @@ class FiniteElements:
         Those that gather light, others interpolate theirs.
     contacts : Contacts
         Vertices whose light is in part none for the triangles around them.
-    lighting : CubemapLighting
     max_depth : int
         As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
         nothing are left out.
@@ -85,12 +84,11 @@ class FiniteElements:
         keys: NDArray[np.uint64],
         nodes: Nodes,
         contacts: Contacts,
-        lighting: CubemapLighting,
         max_depth: int,
         seed: int,
     ) -> None:
         self.matrix, self._albedo, self._keys, self.nodes = matrix, albedo, keys, nodes
-        self.contacts, self.lighting, self.max_depth, self.seed = contacts, lighting, max_depth, seed
+        self.contacts, self.max_depth, self.seed = contacts, max_depth, seed
         self.channels = len(albedo)
 
     def apply(self, columns: Floats) -> Floats:
@@ -118,12 +116,12 @@ class FiniteElements:
             result[:, part] = np.stack([self.nodes.spread(total) for total in totals], axis=-1)
         return result
 
-    def rows(self, direct: Part, ids: NDArray[np.integer]) -> Floats:
+    def rows(self, direct: Operator, ids: NDArray[np.integer]) -> Floats:
         """Indirect light of a few vertices, without approximation: bounces in reverse ([Leh07] 2.6).
 
         Parameters
         ----------
-        direct : Part
+        direct : Operator
             The direct part of the matrix, with a row for each vertex.
         ids : (k,) integers
 
@@ -135,8 +133,8 @@ class FiniteElements:
         direct = self.contacts.lit(direct)
         count = self._count_for(direct)
         totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
-        result = np.empty((len(ids), self.lighting.n_directions, self.channels), np.float32)
-        for texels, light in DirectColumns(direct, self.lighting).blocks(len(self._albedo[0])):
+        result = np.empty((len(ids), direct.shape[1], self.channels), np.float32)
+        for texels, light in ColumnBlocks(direct):
             for c, weights in enumerate(totals):
                 result[:, texels, c] = weights.T @ light
         return result
@@ -155,12 +153,12 @@ class FiniteElements:
     def _transposed(self) -> scipy.sparse.csr_array:
         return self.matrix.T.tocsr()
 
-    def indirect(self, direct: Part, tolerance: float = 0.03) -> Gathered:
+    def indirect(self, direct: Operator, tolerance: float = 0.03) -> Gathered:
         """Indirect light for all texels, factored.
 
         Parameters
         ----------
-        direct : Part
+        direct : Operator
             The direct part of the matrix, with a row for each vertex.
         tolerance : float
             Relative L2 error of the first bounce that a low rank may cost; later bounces are smoother and lose less.
@@ -173,10 +171,10 @@ class FiniteElements:
         count = self._count_for(direct)
         if count == 0:
             left = np.zeros((self._albedo.shape[1], 0), np.float32)
-            right = np.zeros((0, self.lighting.n_directions), np.float32)
+            right = np.zeros((0, direct.shape[1]), np.float32)
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         keys = self._keys[self.nodes.ids]
-        first = first_bounce(self.matrix, self._albedo, direct, self.lighting, keys, tolerance, self.seed)
+        first = first_bounce(self.matrix, self._albedo, direct, keys, tolerance, self.seed)
         totals = self._all_bounces(first, count, LATER * tolerance**2)
         spread = tuple(self.nodes.spread(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
@@ -200,8 +198,8 @@ class FiniteElements:
                 total[:, i] += x
         return totals
 
-    def _count_for(self, direct: Part) -> int:
-        return self.bounces(direct.relight(np.ones((self.lighting.n_directions, 3), np.float32))[:, 0])
+    def _count_for(self, direct: Operator) -> int:
+        return self.bounces(direct.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0])
 
     def bounces(self, even: Floats) -> int:
         """How many interreflections count for anything.
@@ -308,7 +306,6 @@ class RadiositySolver(FiniteElements):
             points.keys,
             nodes,
             contacts(scene, lighting),
-            lighting,
             max_depth,
             seed,
         )

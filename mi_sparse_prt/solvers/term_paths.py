@@ -1,50 +1,90 @@
-"""Terms of glossy BRDFs by path tracing: what finite elements among glossy surfaces are held against.
+"""Terms of glossy BRDFs by rays and by path tracing: no finite elements, no interpolation.
 
-``T_k(x, j)`` is the integral of ``f_k(w) L(x, w; j)`` over directions w ([HR10] eq. 3), L the radiance that comes by
-way of other surfaces. With cosine-distributed first rays it is the mean of f_k(w) pi / cos times the radiance that they
-find, as white light is that of the radiance alone. All terms of a vertex share its paths.
+``T_k(x, j)`` is the integral of ``f_k(w) L(x, w; j)`` over directions w ([HR10] eq. 3), L the radiance that comes from
+the sky or by way of other surfaces. With cosine-distributed first rays it is the mean of f_k(w) pi / cos times the
+radiance that they find, as unit-albedo transport is that of the radiance alone. All terms of a vertex share its paths.
 """
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
-from mi_sparse_prt.solvers.glossy_radiosity import Lobes
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.solvers.direct_rays import LANES, DirectSolver
+from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 
 
 class TermPaths(PathSolver):
-    """Indirect white light and terms of a grey scene's vertices; paths ask Mitsuba's BSDFs of all surfaces they meet.
+    """Indirect light and terms at vertices; paths ask Mitsuba's BSDFs of all surfaces they meet.
 
-    Channels are white light and K terms, which are 0 where a vertex is not glossy: ``elements`` gives (n, 1 + K), in
-    1/sr and per sr of light. An element's channels are not independent of each other, those of two elements are.
+    An element has 1 + K rows, unit-albedo transport and the terms, which are 0 where a vertex is not glossy, in 1/sr
+    and per sr of light; each has the colours of the problem: ``elements`` gives (n, (1 + K) * colours), colours side by
+    side. Those of an element are not independent of each other, those of two elements are.
 
     Parameters
     ----------
-    scene : mi.Scene
-        Normalised copy without emitters; red stands for all colours.
-    direct : FactoredVisibility
-        It has the light directions, the frames and the incident factors.
-    points : Points
-        Of all vertices.
-    max_depth, spp, seed : int
+    problem : Problem
+        With in-out factors.
+    spp, seed : int
         As for ``PathSolver``.
+    lighting : CubemapLighting, optional
+        A coarser one than the problem's; an element is then the mean over its texel.
     """
 
     def __init__(
-        self,
-        scene: mi.Scene,
-        direct: FactoredVisibility,
-        points: Points,
-        max_depth: int = 5,
-        spp: int = 16,
-        seed: int = 0,
+        self, problem: Problem, spp: int = 16, seed: int = 0, lighting: CubemapLighting | None = None
     ) -> None:
-        super().__init__(scene, direct.lighting, points, "direction", max_depth, spp, 1 + direct.terms, seed)
-        self._lobes = Lobes(direct, np.empty((0, *direct.tables.shape), np.float32))
+        assert isinstance(problem.reflection, InOutFactors)
+        self.colours, rows = problem.channels, 1 + problem.reflection.terms
+        super().__init__(
+            problem.scene.normalised,
+            lighting or problem.emission,
+            problem.points,
+            problem.basis if lighting is None else "texel",
+            problem.max_depth,
+            spp,
+            rows * self.colours,
+            seed,
+        )
+        self._lobes = Lobes(problem.reflection)
 
     def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:
-        return [radiance.x, *(weight * radiance.x for weight in self._lobes.incident(point, direction))]
+        weights = [mi.Float(1), *self._lobes.incident(point, direction)]
+        return [weight * radiance[c] for weight in weights for c in range(self.colours)]
+
+
+class TermRays:
+    """Direct light and terms at vertices, by shadow rays.
+
+    Parameters
+    ----------
+    direct : DirectSolver
+    reflection : InOutFactors
+        Of the same points.
+    """
+
+    def __init__(self, direct: DirectSolver, reflection: InOutFactors) -> None:
+        self._direct, self._lobes = direct, Lobes(reflection)
+        self._terms = reflection.terms
+
+    def elements(
+        self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
+    ) -> NDArray[np.float32]:
+        """Unit-albedo row and terms of listed elements, (n, 1 + K) float32; see ``DirectSolver.elements``."""
+        result = np.zeros((len(point_ids), 1 + self._terms), np.float32)
+        size = LANES // (self._direct.rays_per_element * (1 + self._terms))
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            rows = self._direct.weighted_means(
+                points, texels, lambda point, w: [mi.Float(1), *self._lobes.incident(point, w)], seed
+            )
+            dr.eval(rows)
+            result[part] = np.stack([row.numpy() for row in rows], axis=1)
+        return result * (self._direct.lighting.solid_angles[texel_ids] / np.float32(np.pi))[:, None]

@@ -7,20 +7,16 @@ around, it is light that leaks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import Bits, above_horizon, bits_at, unpack
+from mi_sparse_prt.core.bits import Bits, above_horizon, bits_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
-from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.operators.operator import Part
-from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.scene.scene import Scene
 
 BEYOND = 0.02  # of the way from a triangle's middle to a corner: what is as near behind it touches it
@@ -47,63 +43,14 @@ class Contacts:
     open: Bits
     lighting: CubemapLighting
 
-    def lit(self, direct: Part) -> Part:
+    def lit(self, direct: Operator) -> Operator:
         """Direct light, with a row for each vertex, without what comes from behind surfaces that vertices touch."""
-        if not len(self.vertices):
-            return direct
-        if isinstance(direct, MeanCosine):
-            fixed = direct.fixed.copy()
-            fixed[self.vertices] *= unpack(self.open, fixed.shape[1])
-            return replace(direct, fixed=fixed)
-        if not isinstance(direct, Visibility | FractionalVisibility | FactoredVisibility):
-            return _Lit(direct, self)
-        bits = direct.bits.copy()
-        bits[self.vertices] &= self.open
-        if not isinstance(direct, FractionalVisibility):
-            return replace(direct, bits=bits)
-        return replace(direct, bits=bits, shares=self._lit_shares(direct))
-
-    def _lit_shares(self, direct: FractionalVisibility) -> NDArray[np.uint8]:
-        """Shares of the texels that edges cut, those behind surfaces being 0."""
-        shares, first = direct.shares.copy(), direct.starts[self.vertices]
-        lengths = direct.starts[self.vertices + 1] - first
-        row = np.repeat(np.arange(len(lengths)), lengths)
-        entries = np.arange(len(row)) + (first - np.cumsum(lengths) + lengths)[row]
-        shares[entries] *= bits_at(self.open, row, direct.texels[entries]).astype(np.uint8)
-        return shares
+        return direct.masked(self.vertices, self.open) if len(self.vertices) else direct
 
     def counts(self, vertices: Ids, texels: Ids) -> NDArray[np.bool_]:
         """Whether light of texels at vertices, (m,) each, counts for the triangles around."""
         result, some = np.ones(len(vertices), np.bool_), np.isin(vertices, self.vertices)
         result[some] = bits_at(self.open, np.searchsorted(self.vertices, vertices[some]), texels[some])
-        return result
-
-
-@dataclass(frozen=True)
-class _Lit:
-    """Any direct part, of one channel, as ``Contacts.lit`` says."""
-
-    part: Part
-    contacts: Contacts
-
-    @property
-    def nbytes(self) -> int:
-        return self.part.nbytes + self.contacts.open.nbytes
-
-    def rows(self, ids: Ids) -> NDArray[np.float32]:
-        every = np.arange(self.contacts.lighting.n_directions)
-        counts = self.contacts.counts(np.repeat(ids, len(every)), np.tile(every, len(ids)))
-        return self.part.rows(ids) * counts.reshape(len(ids), -1, 1)
-
-    def columns(self, ids: Ids) -> NDArray[np.float32]:
-        result, own = self.part.columns(ids), self.contacts.vertices
-        counts = self.contacts.counts(np.repeat(own, len(ids)), np.tile(ids, len(own)))
-        result[own] *= counts.reshape(len(own), -1, 1)
-        return result
-
-    def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        result, own = self.part.relight(lighting), self.contacts.vertices
-        result[own] = self.rows(own)[..., 0] @ lighting
         return result
 
 

@@ -28,11 +28,12 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.scene.scene import Scene, watertight_scene
+from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation import matrix_figures as draw
 
 TURNS = (0, 60, -60)  # degrees, of the scene's own camera
@@ -87,7 +88,7 @@ class GlossyValidation:
 
 def validate_glossy(
     scene: Scene,
-    transport: GlossyTransport,
+    transport: LightTransport,
     environments: Mapping[str, Environment | mi.Emitter | ArrayLike] | None = None,
     sensors: Sequence[mi.Sensor] | None = None,
     spp: int = 256,
@@ -101,7 +102,7 @@ def validate_glossy(
     ----------
     scene : Scene
         The scene of the transport.
-    transport : GlossyTransport
+    transport : LightTransport
     environments : mapping of names to environments, emitters or texel radiances (n_directions, 3), optional
         All are projected to the transport's lighting first, for all images. Default: the scene's own.
     sensors : sequence of mi.Sensor, optional
@@ -243,7 +244,7 @@ class DirectionLights(CubemapEmitter):
 class _References:
     """A scene under one lighting as Mitsuba and as the transport see it."""
 
-    def __init__(self, scene: Scene, transport: GlossyTransport, radiance: NDArray[np.float32]) -> None:
+    def __init__(self, scene: Scene, transport: LightTransport, radiance: NDArray[np.float32]) -> None:
         self._scene, self._transport, self._radiance = scene, transport, radiance
         n, shapes = transport.lighting.resolution, scene.unlit_shapes()
         sky = background_emitter(radiance, transport.lighting)
@@ -279,7 +280,7 @@ class _References:
         """Pixels (height, width) of the whole image, on glossy surfaces, and in thin shadows."""
         shape, normal = self._seen(sensor)
         image = np.ones(shape.shape, bool)
-        found = self._transport.material[[mesh.vertices.start for mesh in self._scene.meshes]] >= 0
+        found = _surfaces(self._transport).material[[mesh.vertices.start for mesh in self._scene.meshes]] >= 0
         glossy = np.append(found, False)[shape]  # -1: none
         light = self._path("diffuse", sensor, 2, 4 * spp, seed).mean(axis=2)
         unshadowed = self._unshadowed(normal.reshape(-1, 3)).reshape(shape.shape)
@@ -343,13 +344,18 @@ def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter) -> mi.Scene:
     return mi.load_dict({**watertight_scene(), "light": light, **named})
 
 
-def _factored_shapes(scene: Scene, transport: GlossyTransport, shapes: list[mi.Mesh]) -> list[mi.Mesh]:
+def _surfaces(transport: LightTransport) -> InOutFactors:
+    assert isinstance(transport.reflection, InOutFactors)
+    return transport.reflection
+
+
+def _factored_shapes(scene: Scene, transport: LightTransport, shapes: list[mi.Mesh]) -> list[mi.Mesh]:
     """The meshes with the glossy BSDFs replaced by the transport's factors of them."""
-    found = []
+    found, surfaces = [], _surfaces(transport)
     for shape, mesh, own in zip(shapes, scene.meshes, scene.materials, strict=True):
-        number = int(transport.material[mesh.vertices.start])
+        number = int(surfaces.material[mesh.vertices.start])
         if number >= 0:
-            shape = with_bsdf(shape, factored_bsdf(transport.factors[number], own.bsdf))
+            shape = with_bsdf(shape, factored_bsdf(surfaces.factors[number], own.bsdf))
         found.append(shape)
     return found
 

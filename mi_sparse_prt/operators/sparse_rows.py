@@ -1,0 +1,75 @@
+"""Rows with few elements that are not 0, as a sparse matrix per channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
+
+
+@dataclass(frozen=True)
+class SparseRows(Operator):
+    """Light that arrives from few directions.
+
+    Attributes
+    ----------
+    matrices : tuple of (n, m) sparse float32
+        One for all channels, or three.
+
+    Raises
+    ------
+    PrtError
+        If a value is NaN or infinite.
+    """
+
+    kind: ClassVar[str] = "sparse_rows"
+    matrices: tuple[scipy.sparse.csr_array, ...]
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(matrix.data).all() for matrix in self.matrices):
+            raise PrtError("SparseRows: values are NaN or infinite; repair what they were computed from")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        n, m = self.matrices[0].shape
+        return n, m, len(self.matrices)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(sparse_nbytes(matrix) for matrix in self.matrices)
+
+    def rows(self, ids: Ids) -> Floats:
+        return np.stack([matrix[np.asarray(ids)].toarray() for matrix in self.matrices], axis=-1)
+
+    def columns(self, ids: Ids) -> Floats:
+        return np.stack([matrix[:, np.asarray(ids)].toarray() for matrix in self.matrices], axis=-1)
+
+    def _apply_same(self, x: Floats) -> Floats:
+        return np.stack([matrix @ x for matrix in self.matrices], axis=1)
+
+    def _apply_each(self, x: Floats) -> Floats:
+        return np.stack([matrix @ x[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
+
+    def _adjoint_by_rows(self, y: Floats) -> Floats:
+        return np.stack([matrix.T @ y[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
+
+    def take(self, ids: Ids) -> SparseRows:
+        return replace(self, matrices=tuple(matrix[np.asarray(ids)] for matrix in self.matrices))
+
+    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
+        channels = [sparse_to_arrays(f"channel_{c}", matrix) for c, matrix in enumerate(self.matrices)]
+        return {name: array for channel in channels for name, array in channel.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+        count = sum(name.endswith("_indptr") for name in arrays)
+        columns = lighting.n_directions
+        return cls(tuple(sparse_from_arrays(f"channel_{c}", arrays, columns) for c in range(count)))
