@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
