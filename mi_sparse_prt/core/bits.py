@@ -14,6 +14,8 @@ from llvmlite import ir
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
+
 Bits = NDArray[np.uint32]
 BITS = 32  # of a word
 
@@ -111,7 +113,7 @@ def scattered(mask: Bits, values: NDArray[np.bool_]) -> Bits:
 
 def _starts(bits: Bits) -> NDArray[np.int64]:
     """Where the set bits of each row start in a list of all, and its length, (n + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts(bits))])
+    return row_starts(counts(bits))
 
 
 @numba.njit(parallel=True, cache=True)

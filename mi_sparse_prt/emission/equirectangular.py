@@ -16,6 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import concatenate_ranges
+
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int_]
 
@@ -172,6 +174,4 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 def _ranges(first: Ints, stop: Ints) -> tuple[Ints, Ints]:
     """Concatenated ranges first[i], ..., stop[i] - 1: the index i of each member, and the member."""
-    counts = np.maximum(stop - first, 0)
-    owner = np.repeat(np.arange(len(first)), counts)
-    return owner, np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner] + first[owner]
+    return concatenate_ranges(first, np.maximum(stop - first, 0))

@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.bits import Bits, listed, pack
 from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.ragged import concatenate_ranges, row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.neighbours import Neighbours
@@ -84,7 +85,7 @@ def indirect_part(
         counts.append(present.sum(axis=1))
         columns.append(near.ids[present])
         values.append(corrected[present])
-    starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+    starts = row_starts(np.concatenate(counts))
     entries = np.concatenate(values), np.concatenate(columns), starts
     weights = scipy.sparse.csr_array(entries, shape=(len(scene.positions), len(dense.ids)))
     for file in kept:
@@ -138,7 +139,7 @@ def _smoothing(
     """
     ids, weights = near.ids[rows], prior[rows]
     present = ids >= 0
-    starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    starts = row_starts(present.sum(axis=1))
     entries = weights[present], ids[present] - first, starts
     return scipy.sparse.csr_array(entries, shape=(len(rows), len(rows)))
 
@@ -248,7 +249,7 @@ class _Fit:
         self.elements += len(rows)
         with self._clock.phase("system"):
             count = np.bincount(rows, minlength=len(ids))
-            at = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+            at = concatenate_ranges(np.zeros(len(ids), np.int64), count)[1]  # place of each sample in its row
             directions = np.full((len(ids), max(2, int(count.max(initial=0)))), -1, np.int32)
             directions[rows, at] = self._place[texels]
             values = np.zeros((self._solver.channels, *directions.shape), np.float32)

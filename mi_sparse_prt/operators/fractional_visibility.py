@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, bit_of
 from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 FULL = 255  # a share of 1
@@ -73,9 +74,7 @@ class FractionalVisibility:
     def reordered(self, source: Ids) -> FractionalVisibility:
         """Some rows, in this order."""
         source = np.asarray(source)
-        counts = np.diff(self.starts)[source]
-        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        entries = np.arange(starts[-1]) + np.repeat(self.starts[:-1][source] - starts[:-1], counts)
+        starts, _, entries = select_rows(self.starts, source)
         return replace(
             self,
             bits=self.bits[source],

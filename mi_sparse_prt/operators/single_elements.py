@@ -7,6 +7,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import bits_at
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.haar_rows import HaarRows
@@ -88,10 +89,7 @@ def _entries(
     matrix: scipy.sparse.csr_array, rows: Ids
 ) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.floating]]:
     """Position in ``rows``, column and value of all entries of these rows of a matrix."""
-    counts = np.diff(matrix.indptr)[rows]
-    position = np.repeat(np.arange(len(rows)), counts)
-    within = np.arange(len(position)) - np.repeat(np.cumsum(counts) - counts, counts)
-    entry = matrix.indptr[rows][position] + within
+    _, position, entry = select_rows(matrix.indptr, rows)
     return position, matrix.indices[entry], matrix.data[entry]
 
 

@@ -7,6 +7,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.morton import along_curve
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.measurement.neighbours import surface_neighbours
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
@@ -70,7 +71,7 @@ def _of_mesh(
     weights = linear_weights(near, p, n, p[nodes], n[nodes])
     rank = np.argsort(np.argsort(nodes))  # of each node among all of the mesh
     present = near.ids >= 0
-    starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    starts = row_starts(present.sum(axis=1))
     entries = weights[present], rank[near.ids[present]], starts
     block = scipy.sparse.csr_array(entries, shape=(len(p), len(nodes)))
     return inside.start + np.sort(nodes), block

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, counts, listed, lowest
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.emission.texel_adjacency import Sides, TexelSides
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -76,15 +77,10 @@ def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalV
         first = sides.tables.first[pairs]
         first_seen = (block[rows, first // BITS] >> (first % BITS).astype(np.uint32)) & np.uint32(1)
         places = _bisected(direct, paths, rows + np.uint32(a), pairs, first_seen)
-        blocks.append(_cut_texels(sides, block, above, Crossings(_starts(counts(crossed)), pairs, places)))
+        blocks.append(_cut_texels(sides, block, above, Crossings(row_starts(counts(crossed)), pairs, places)))
         rays += STEPS * len(pairs)
     seen, number, texels, shares = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    return FractionalVisibility(seen, _starts(number), texels, shares, normals, direct.lighting), rays
-
-
-def _starts(number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where so many entries each begin in a list of all, and its length."""
-    return np.concatenate([[0], np.cumsum(number)])
+    return FractionalVisibility(seen, row_starts(number), texels, shares, normals, direct.lighting), rays
 
 
 def _bisected(
@@ -116,12 +112,12 @@ def _cut_texels(
     """Bits, and for each vertex how many texels are seen in part, which, and their shares."""
     horizon = sides.crossed(above, np.full_like(above, 0xFFFFFFFF))
     m = len(sides.tables.beside)
-    room = _starts(np.minimum(AROUND * np.diff(crossings.starts) + counts(horizon), m))
+    room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + counts(horizon), m))
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)
     number = np.empty(len(bits), np.int64)
     threads = numba.get_num_threads()
     _find_shares(sides.tables, bits, above, horizon, crossings, threads, room, seen, entries, number)
-    starts = _starts(number)
+    starts = row_starts(number)
     texels, shares = np.empty(starts[-1], np.min_scalar_type(m - 1)), np.empty(starts[-1], np.uint8)
     _unpack(entries, room, starts, texels, shares)
     return seen, number, texels, shares

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, above_horizon, bits_at, unpack
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
@@ -65,10 +66,8 @@ class Contacts:
 
     def _lit_shares(self, direct: FractionalVisibility) -> NDArray[np.uint8]:
         """Shares of the texels that edges cut, those behind surfaces being 0."""
-        shares, first = direct.shares.copy(), direct.starts[self.vertices]
-        lengths = direct.starts[self.vertices + 1] - first
-        row = np.repeat(np.arange(len(lengths)), lengths)
-        entries = np.arange(len(row)) + (first - np.cumsum(lengths) + lengths)[row]
+        shares = direct.shares.copy()
+        _, row, entries = select_rows(direct.starts, self.vertices)
         shares[entries] *= bits_at(self.open, row, direct.texels[entries]).astype(np.uint8)
         return shares
 
