@@ -11,9 +11,6 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import load_environment
 
-# Distance of the light in units of 1 + |position|: far behind any ceiling, near enough for float32
-FAR = 1e6
-
 
 class CubemapEmitter(mi.Emitter):
     r"""Cubemap environment emitter (:monosp:`cubemap`)
@@ -150,8 +147,9 @@ class CubemapEmitter(mi.Emitter):
         ds = dr.zeros(mi.DirectionSample3f)
         ds.d = face_direction(face, s, t)
         ds.n = -ds.d
-        # The scene's extent is not known here, so the distance comes from the point's
-        ds.dist = FAR * (1 + dr.max(dr.abs(it.p)))
+        # The scene's extent is not known here, so the distance comes from the point's: far behind any ceiling, and
+        # near enough for float32
+        ds.dist = 1e6 * (1 + dr.max(dr.abs(it.p)))
         ds.p = it.p + ds.d * ds.dist
         ds.time = it.time
         ds.delta = False
