@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.block_products import multiply_rows
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
 from mi_sparse_prt.emission.cubemap import CubemapLighting
@@ -32,10 +32,10 @@ from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reflection.brdf_factors import (
     BrdfFactors,
-    anisotropic,
     diffuse_reflectance,
     factors_of,
     harmonic_factors,
+    is_anisotropic,
 )
 from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tables
 from mi_sparse_prt.reflection.frames import beside_vertices, frames, vertex_tangents
@@ -135,7 +135,7 @@ class GlossyTransport:
 
     def project_white(self, vectors: Floats, ids: NDArray[np.integer]) -> Floats:
         """Some rows times vectors (n_directions, r): (k, r, channels)."""
-        found = rows_times(lambda some: self.direct.rows(ids[some]), len(ids), vectors)
+        found = multiply_rows(lambda some: self.direct.rows(ids[some]), len(ids), vectors)
         return found if self.indirect is None else found + self.indirect.reordered(ids).project(vectors)
 
     def for_scene(self, scene: Scene) -> GlossyTransport:
@@ -389,7 +389,7 @@ def factored_materials(
     for mesh, own, shape in zip(scene.meshes, scene.materials, scene.mitsuba.shapes(), strict=True):
         if own.diffuse:
             continue
-        if not shape.has_vertex_texcoords() and anisotropic(own.bsdf, mesh.name):
+        if not shape.has_vertex_texcoords() and is_anisotropic(own.bsdf, mesh.name):
             warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=3)
         digest = own.digest()
         if digest not in known:

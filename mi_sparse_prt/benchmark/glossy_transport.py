@@ -19,7 +19,7 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.reflection.brdf_factors import factor_error
-from mi_sparse_prt.scene.materials import kind
+from mi_sparse_prt.scene.materials import bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
@@ -143,7 +143,7 @@ def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
         found.append(
             {
                 "mesh": mesh.name,
-                "bsdf": kind(material.bsdf),
+                "bsdf": bsdf_class(material.bsdf),
                 "terms": factors.terms,
                 "whole": error.whole.tolist(),
                 "grazing": error.grazing.tolist(),

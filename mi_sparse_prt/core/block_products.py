@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.threads import overlapped
+from mi_sparse_prt.core.threads import run_overlapped
 
 ROWS = 2048
 MADE = 256  # rows at a time, of which some stay in the cache
@@ -17,7 +17,7 @@ MADE = 256  # rows at a time, of which some stay in the cache
 Floats = NDArray[np.float32]
 
 
-def in_blocks(matrix: NDArray[Any], vectors: Floats) -> Floats:
+def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:
     """``matrix @ vectors``; the matrix (n, m) holds small numbers, converted to float32 on the way."""
     product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
     for a in range(0, len(matrix), ROWS):
@@ -25,7 +25,7 @@ def in_blocks(matrix: NDArray[Any], vectors: Floats) -> Floats:
     return product
 
 
-def rows_times(rows: Callable[[NDArray[np.int64]], Floats], count: int, vectors: Floats) -> Floats:
+def multiply_rows(rows: Callable[[NDArray[np.int64]], Floats], count: int, vectors: Floats) -> Floats:
     """Products (count, k, 1) of rows (n, m, 1), made from their numbers (n,), with vectors (m, k)."""
     product = np.empty((count, vectors.shape[1], 1), np.float32)
 
@@ -33,6 +33,8 @@ def rows_times(rows: Callable[[NDArray[np.int64]], Floats], count: int, vectors:
         product[some, :, 0] = made[..., 0] @ vectors
 
     blocks = [slice(a, min(a + MADE, count)) for a in range(0, count, MADE)]
-    for _ in overlapped(partial(multiply, some, rows(np.arange(some.start, some.stop))) for some in blocks):
+    for _ in run_overlapped(
+        partial(multiply, some, rows(np.arange(some.start, some.stop))) for some in blocks
+    ):
         pass
     return product

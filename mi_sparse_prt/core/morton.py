@@ -16,7 +16,7 @@ _SPREAD = (
 )
 
 
-def along_curve(positions: NDArray[np.floating], keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+def morton_order(positions: NDArray[np.floating], keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     """Order (n,) of positions along Morton's curve through their box.
 
     Parameters

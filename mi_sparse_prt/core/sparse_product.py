@@ -13,12 +13,12 @@ SLAB = 512  # columns at a time: more of the dense matrix stays in the cache
 Floats = NDArray[np.float32]
 
 
-def product(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
+def multiply_sparse(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
     """A sparse matrix (n, m) times a dense one (m, k), float32; the same for any number of threads."""
-    return gathered(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
+    return multiply_scaled(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
 
 
-def gathered(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
+def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
     """G rho x for several albedos rho and one light x, of which each row is read once for all of them.
 
     Parameters

@@ -52,7 +52,7 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(threads)
 
 
-def overlapped(tasks: Iterable[Callable[[], Result]]) -> Iterator[Result]:
+def run_overlapped(tasks: Iterable[Callable[[], Result]]) -> Iterator[Result]:
     """Results of tasks, in their order; some are worked on while the next ones are prepared."""
     with one_thread(), ThreadPoolExecutor(WORKERS) as pool:
         pending: deque[Future[Result]] = deque()

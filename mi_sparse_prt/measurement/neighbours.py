@@ -67,8 +67,8 @@ def radius_neighbours(
     PrtError
         If a position is not finite, the radius is negative or not a number, or ``most`` is less than 1.
     """
-    points = finite_rows(positions, "vertex", "position")
-    dense = finite_rows(dense_positions, "dense vertex", "position")
+    points = check_finite_rows(positions, "vertex", "position")
+    dense = check_finite_rows(dense_positions, "dense vertex", "position")
     if not radius >= 0:
         raise PrtError(f"radius is {radius}: give a distance of 0 or more")
     _check_count("most", most)
@@ -108,9 +108,9 @@ def surface_neighbours(
         If a position or a normal is not finite, or ``count`` is less than 1.
     """
     _check_count("count", count)
-    p, n = finite_rows(positions, "vertex", "position"), finite_rows(normals, "vertex", "normal")
-    dense_p = finite_rows(dense_positions, "dense vertex", "position")
-    dense_n = finite_rows(dense_normals, "dense vertex", "normal")
+    p, n = check_finite_rows(positions, "vertex", "position"), check_finite_rows(normals, "vertex", "normal")
+    dense_p = check_finite_rows(dense_positions, "dense vertex", "position")
+    dense_n = check_finite_rows(dense_normals, "dense vertex", "normal")
     s = _spacing(dense_p)
     points, dense = (
         np.hstack([p, s * n]),
@@ -158,12 +158,12 @@ def _take_agreeing(
     return complete
 
 
-def renumbered(ids: NDArray[np.integer], names: NDArray[np.integer]) -> NDArray[np.int32]:
+def renumber(ids: NDArray[np.integer], names: NDArray[np.integer]) -> NDArray[np.int32]:
     """Neighbours by other names: ``names[ids]``, and -1 where there are none."""
     return np.append(names, -1).astype(np.int32)[ids]
 
 
-def finite_rows(values: NDArray[np.floating], vertex: str, what: str) -> NDArray[np.float64]:
+def check_finite_rows(values: NDArray[np.floating], vertex: str, what: str) -> NDArray[np.float64]:
     """As (n, 3) float64, or an error that names the first row that is not finite."""
     rows = np.asarray(values, np.float64).reshape(-1, 3)
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from mi_sparse_prt.core.bits import counts
+from mi_sparse_prt.core.bits import count_bits
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.brute_force import exact_direct, path_traced
@@ -88,7 +88,7 @@ class Evaluation:
 
     def _consensus(self) -> MethodResult:
         state = by_consensus(self._scene, self._solver, self._clock)
-        rays = int(counts(state.evaluated).sum())
+        rays = int(count_bits(state.evaluated).sum())
         bits = Visibility(state.visible, self._scene.normals, self._solver.lighting)
         return MethodResult(bits, None, rays, {"direct": rays, "indirect": 0}, {"direct": rays})
 

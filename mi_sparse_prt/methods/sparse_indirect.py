@@ -15,7 +15,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.bits import Bits, listed, pack
+from mi_sparse_prt.core.bits import Bits, list_bits, pack
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.core.ragged import concatenate_ranges, row_starts
 from mi_sparse_prt.core.random_keys import mix
@@ -25,10 +25,10 @@ from mi_sparse_prt.methods.dense_neighbourhoods import Neighbourhood
 from mi_sparse_prt.methods.dense_sampling import Dense, indirect_of
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.upsampled import Upsampled
-from mi_sparse_prt.reconstruction.denoising import DenoisedRows, denoised, smoothed
+from mi_sparse_prt.reconstruction.denoising import DenoisedRows, denoise_rows, smooth_rows
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
-from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
+from mi_sparse_prt.reconstruction.ridge import System, choose_deviation, fit_correction, shift_to_prior
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -125,7 +125,7 @@ def _dense_rows(
             smoothing = _smoothing(dense.ids[chosen] - group.mesh.vertices.start, chosen.start, *prior)
             for c in range(solver.channels):
                 mean, variance = rows.mean[..., c], rows.variance[..., c]
-                factors = _with_sums_of(mean, smoothed(denoised(mean, variance), smoothing))
+                factors = _with_sums_of(mean, smooth_rows(denoise_rows(mean, variance), smoothing))
                 np.matmul(*factors, out=density[chosen, :, c])
     return density, noise, files
 
@@ -217,7 +217,7 @@ class _Fit:
         pilot = np.sort(group.sparse[order[:PILOT]])
         halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start], 2)
         with self._clock.phase("solver"):
-            deviation = best_deviation((halves[0], halves[1]), noise)
+            deviation = choose_deviation((halves[0], halves[1]), noise)
         if deviation == 0:
             return weights
         for ids in self._batches(group, pilot, progress):
@@ -225,7 +225,7 @@ class _Fit:
                 halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start], 1)
             with self._clock.phase("solver"):
                 system = sum(halves[1:], halves[0])
-                weights[ids - start] += correction(system, noise, deviation).astype(np.float32)
+                weights[ids - start] += fit_correction(system, noise, deviation).astype(np.float32)
         return weights
 
     @staticmethod
@@ -243,7 +243,7 @@ class _Fit:
     ) -> tuple[list[System], NDArray[np.float64]]:
         """Systems of every so many samples of some vertices, and the noise of one sample of each, (n,)."""
         with self._clock.phase("system"):
-            rows, texels = listed(self._evaluated[ids] & pack(self._place >= 0))
+            rows, texels = list_bits(self._evaluated[ids] & pack(self._place >= 0))
         with self._clock.phase("sparse_paths"):
             found = self._solver.elements(ids[rows].astype(np.uint32), texels)
         self.elements += len(rows)
@@ -273,7 +273,7 @@ class _Fit:
         taken, a = np.ascontiguousarray(directions), prior.astype(np.float64)
         count = (taken >= 0).sum(axis=1)
         systems = [
-            about(a, *normal_equations(rows, near, taken, np.ascontiguousarray(y)), count)
+            shift_to_prior(a, *normal_equations(rows, near, taken, np.ascontiguousarray(y)), count)
             for rows, y in zip(self._rows, values, strict=True)
         ]
         return sum(systems[1:], systems[0])

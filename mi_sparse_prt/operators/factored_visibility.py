@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.block_products import multiply_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.visibility import Visibility
 
@@ -139,7 +139,7 @@ class FactoredVisibility:
         )
 
     def project(self, vectors: Floats) -> Floats:
-        return rows_times(self.rows, self.count, vectors)
+        return multiply_rows(self.rows, self.count, vectors)
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
         """Sums of the terms' columns at the same place in some words of bits, with signs: (n_g * K, bits of a word)."""

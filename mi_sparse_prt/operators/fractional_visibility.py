@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, bit_of
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.block_products import multiply_rows
 from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 
@@ -69,7 +69,7 @@ class FractionalVisibility:
         return _relight(self.bits, *listed, self.normals, directions, ramps, power)
 
     def project(self, vectors: Floats) -> Floats:
-        return rows_times(self.rows, len(self.bits), vectors)
+        return multiply_rows(self.rows, len(self.bits), vectors)
 
     def reordered(self, source: Ids) -> FractionalVisibility:
         """Some rows, in this order."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import in_blocks
+from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Rows
 
@@ -39,10 +39,10 @@ class MeanCosine:
         return (self.fixed[:, ids] * self._weights()[ids])[..., None]
 
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
-        return in_blocks(self.fixed, lighting * self._weights()[:, None])
+        return multiply_converted(self.fixed, lighting * self._weights()[:, None])
 
     def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return in_blocks(self.fixed, vectors * self._weights()[:, None])[..., None]
+        return multiply_converted(self.fixed, vectors * self._weights()[:, None])[..., None]
 
     def reordered(self, source: Rows) -> MeanCosine:
         return replace(self, fixed=self.fixed[source])

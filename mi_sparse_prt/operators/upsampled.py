@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import in_blocks
+from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Rows
 
@@ -50,13 +50,13 @@ class Upsampled:
     def relight(self, lighting: NDArray[np.float32]) -> NDArray[np.float32]:
         coarse = self.upsampling.T @ (lighting * self.lighting.solid_angles[:, None])  # [coarse, rgb]
         if self.density.shape[2] == 1:
-            return in_blocks(self.density[..., 0], coarse)
-        channels = [in_blocks(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
+            return multiply_converted(self.density[..., 0], coarse)
+        channels = [multiply_converted(self.density[..., c], coarse[:, c : c + 1]) for c in range(3)]
         return np.concatenate(channels, axis=1)
 
     def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
         coarse = self.upsampling.T @ (vectors * self.lighting.solid_angles[:, None])  # [coarse, vector]
-        channels = [in_blocks(self.density[..., c], coarse) for c in range(self.density.shape[2])]
+        channels = [multiply_converted(self.density[..., c], coarse) for c in range(self.density.shape[2])]
         return np.stack(channels, axis=-1)
 
     def reordered(self, source: Rows) -> Upsampled:

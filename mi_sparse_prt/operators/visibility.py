@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
-from mi_sparse_prt.core.block_products import rows_times
+from mi_sparse_prt.core.block_products import multiply_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Rows
 
@@ -54,7 +54,7 @@ class Visibility:
         return _relight_bits(self.bits, self.normals, directions, power)
 
     def project(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        return rows_times(self.rows, len(self.bits), vectors)
+        return multiply_rows(self.rows, len(self.bits), vectors)
 
     def reordered(self, source: Rows) -> Visibility:
         return replace(self, bits=self.bits[source], normals=self.normals[source])

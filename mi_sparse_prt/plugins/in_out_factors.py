@@ -14,7 +14,7 @@ from mi_sparse_prt.plugins.reflective_bsdf import (
     sample_phong_lobe,
 )
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
-from mi_sparse_prt.reflection.factor_tables import incident_tables, looked_up, outgoing_tables
+from mi_sparse_prt.reflection.factor_tables import incident_tables, look_up, outgoing_tables
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
 
 LOBE = 10.0  # exponent of the lobe that is sampled: wider than most that few factors can tell
@@ -117,7 +117,7 @@ class InOutFactors(ReflectiveBSDF):
         return dr.select(active, value, 0), dr.select(active, density, 0)
 
     def _looked_up(self, table: mi.Float, local: mi.Vector3f, active: mi.Bool) -> mi.ArrayXf:
-        return mi.ArrayXf(looked_up(table, self._size, self._terms, mi.UInt32(0), local, active))
+        return mi.ArrayXf(look_up(table, self._size, self._terms, mi.UInt32(0), local, active))
 
     def to_string(self) -> str:
         return f"InOutFactors[terms={self._terms}, size={self._size}, diffuse={self.diffuse}]"

@@ -43,7 +43,7 @@ class DenoisedRows:
         return self.left @ self.right
 
 
-def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> DenoisedRows:
+def denoise_rows(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> DenoisedRows:
     """The low-rank matrix closest to the one that noisy rows are estimates of.
 
     Parameters
@@ -77,7 +77,7 @@ def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> Denois
     return DenoisedRows(left * shrunk.astype(np.float32) * by_row[:, None], right * by_column, noise)
 
 
-def smoothed(rows: DenoisedRows, smoothing: scipy.sparse.csr_array) -> DenoisedRows:
+def smooth_rows(rows: DenoisedRows, smoothing: scipy.sparse.csr_array) -> DenoisedRows:
     """Neighbouring rows averaged wherever that takes away no more than noise.
 
     What smoothing would change is scaled by 1 - (its energy if it were noise) / (its energy), 0 at least, with

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.morton import along_curve
+from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.measurement.neighbours import surface_neighbours
 from mi_sparse_prt.measurement.vertices import Points
@@ -60,7 +60,7 @@ def _of_mesh(
         return np.arange(inside.start, inside.stop), scipy.sparse.eye_array(
             wanted, dtype=np.float32, format="csr"
         )
-    order = along_curve(p, points.keys[inside])
+    order = morton_order(p, points.keys[inside])
     # the middle one of each of so many stretches along the curve
     nodes = order[(2 * np.arange(wanted) + 1) * len(p) // (2 * wanted)]
     near = surface_neighbours(p, n, p[nodes], n[nodes], NEIGHBOURS)

@@ -45,7 +45,7 @@ class System:
         return System(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
-def about(
+def shift_to_prior(
     prior: Floats, gram: Floats, correlation: Floats, squared_norm: Floats, count: NDArray[np.int64]
 ) -> System:
     """The system of `reconstruction.systems.normal_equations`, moved to the prior weights (n, k)."""
@@ -54,7 +54,7 @@ def about(
     return System(gram, correlation - product, square, count)
 
 
-def correction(system: System, noise: Floats, deviation: float) -> Floats:
+def fit_correction(system: System, noise: Floats, deviation: float) -> Floats:
     """What to add to the prior weights, (n, k).
 
     Parameters
@@ -73,7 +73,7 @@ def correction(system: System, noise: Floats, deviation: float) -> Floats:
     return np.asarray(np.linalg.solve(damped, system.slope[..., None])[..., 0])
 
 
-def best_deviation(halves: tuple[System, System], noise: Floats) -> float:
+def choose_deviation(halves: tuple[System, System], noise: Floats) -> float:
     """The tau whose correction from one half of the samples fits the other half best; 0 if none is worth it.
 
     Parameters
@@ -94,6 +94,6 @@ def best_deviation(halves: tuple[System, System], noise: Floats) -> float:
 
 def _saved(one: System, other: System, noise: Floats, deviation: float) -> Floats:
     """By how much the correction from one half lowers the square of the other, (n,)."""
-    a = correction(one, noise, deviation)
+    a = fit_correction(one, noise, deviation)
     product = np.einsum("nij,nj->ni", other.gram, a)
     return np.asarray((2 * a * other.slope - a * product).sum(axis=1))

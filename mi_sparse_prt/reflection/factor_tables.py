@@ -48,7 +48,7 @@ def outgoing_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Float
     return _stacked(found)
 
 
-def looked_up(
+def look_up(
     table: mi.Float, size: int, terms: int, material: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
 ) -> list[mi.Float]:
     """Values (terms) of tables (materials, size, size, terms), flattened, in directions of their frames; bilinear."""

@@ -14,7 +14,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.reflection.factor_tables import looked_up, outgoing_tables
+from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
@@ -146,9 +146,7 @@ class GlossyRelitScene(RelitScene):
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
             s = dr.normalize(tangent - si.sh_frame.n * dr.dot(si.sh_frame.n, tangent))
             local = mi.Frame3f(s, dr.cross(si.sh_frame.n, s), si.sh_frame.n).to_local(towards)
-            lobes = [
-                looked_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables
-            ]
+            lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
             for k, values in enumerate(self._terms):
                 coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
                 total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)

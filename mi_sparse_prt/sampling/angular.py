@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, listed, lowest, pack, scattered
+from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, list_bits, lowest_bit, pack, scatter_bits
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
 
 RADIUS = 3  # texels: windows of 7 x 7
@@ -79,10 +79,10 @@ class AngularGrid:
         """
         above = above_horizon(normals, self.lighting.directions)
         first = above & pack(self._sampled)
-        seen = scattered(first, visible(*listed(first)))
+        seen = scatter_bits(first, visible(*list_bits(first)))
         features, borrowed = np.empty_like(first), np.empty_like(first)
         _second_pass(first, seen, above, *self._stamps, features, borrowed)
-        seen |= borrowed | scattered(features, visible(*listed(features)))
+        seen |= borrowed | scatter_bits(features, visible(*list_bits(features)))
         return DenseRows(seen, first | features, features, above)
 
     @cached_property
@@ -178,7 +178,7 @@ def _second_pass(
         for w in range(words):
             left = first[i, w]
             while left:
-                bit = np.uint32(lowest(left))  # type: ignore[call-arg]  # numba gives the context
+                bit = np.uint32(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
                 left &= left - np.uint32(1)
                 kind = (seen[i, w] >> bit) & np.uint32(1)
                 texel = w * BITS + np.int64(bit)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import above_horizon, listed, overwrite
-from mi_sparse_prt.core.morton import along_curve
-from mi_sparse_prt.measurement.neighbours import renumbered, surface_neighbours
+from mi_sparse_prt.core.bits import above_horizon, list_bits, overwrite_bits
+from mi_sparse_prt.core.morton import morton_order
+from mi_sparse_prt.measurement.neighbours import renumber, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.features import contested, copy_agreed
+from mi_sparse_prt.sampling.features import copy_agreed, find_contested
 
 STRIDES = (12, 4, 2, 1)  # one vertex in so many is known after each level; each divides the one before
 NEIGHBOURS = 8  # that are asked
@@ -69,12 +69,12 @@ class Consensus:
 
         All are compared before any is changed: the order of vertices and the size of blocks do not matter.
         """
-        asked = contested(near, self.visible, self.above, vertices, self.above, self.evaluated)
+        asked = find_contested(near, self.visible, self.above, vertices, self.above, self.evaluated)
         for a in range(0, len(vertices), BLOCK):
             some, bits = vertices[a : a + BLOCK], asked[a : a + BLOCK]
-            rows, texels = listed(bits)
+            rows, texels = list_bits(bits)
             values = self._trace(some.astype(np.uint32)[rows], texels)
-            overwrite(self.visible, self.evaluated, some, bits, values)
+            overwrite_bits(self.visible, self.evaluated, some, bits, values)
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ class Surface:
 
     def levels(self) -> list[Ids]:
         """Its vertices (counted from 0) in levels, each spread evenly; independent of the order in which they come."""
-        order = along_curve(self.positions, self.keys)
+        order = morton_order(self.positions, self.keys)
         level = np.full(len(order), len(STRIDES) - 1)
         for number, stride in reversed(list(enumerate(STRIDES))):
             level[::stride] = number
         return [order[level == number] for number in range(len(STRIDES))]
 
 
-def by_levels(state: Consensus, surface: Surface) -> None:
+def sample_by_levels(state: Consensus, surface: Surface) -> None:
     """Make the rows of a mesh known, level by level, and repair them.
 
     Parameters
@@ -120,7 +120,7 @@ def by_levels(state: Consensus, surface: Surface) -> None:
         near = surface_neighbours(p[new], n[new], p[known], n[known], NEIGHBOURS).ids
         lonely = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
         state.sample(surface.first + new[lonely])
-        state.agree(surface.first + new[~lonely], renumbered(near[~lonely], surface.first + known))
+        state.agree(surface.first + new[~lonely], renumber(near[~lonely], surface.first + known))
         known = np.concatenate([known, new])
     around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[:, 1:]  # without itself
-    state.repair(surface.first + known, renumbered(around, surface.first + np.arange(len(p))))
+    state.repair(surface.first + known, renumber(around, surface.first + np.arange(len(p))))

@@ -10,10 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import ones
+from mi_sparse_prt.core.bits import count_ones
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.measurement.neighbours import finite_rows, radius_neighbours
+from mi_sparse_prt.measurement.neighbours import check_finite_rows, radius_neighbours
 
 ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its rank accounts for
 RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box
@@ -99,7 +99,7 @@ def choose_dense(
     n = len(positions)
     # all below is in the order of keys: ties of every kind then fall the same way in whatever order vertices come
     by_key = np.argsort(keys, kind="stable")
-    p, names = finite_rows(positions, "vertex", "position")[by_key], np.asarray(keys)[by_key]
+    p, names = check_finite_rows(positions, "vertex", "position")[by_key], np.asarray(keys)[by_key]
     if radius is None:
         radius = RADIUS * float(np.ptp(p, axis=0).max()) if n else 0.0
     total = _share(fraction, n)
@@ -122,7 +122,7 @@ def choose_dense(
         left = np.flatnonzero(free)
         wanted = min(_share(step, n), total - (n - len(left)))
         weights = ranks[left] ** power if len(dense) else np.ones(len(left), np.float32)
-        new = left[weighted_choice(weights, names[left], wanted, _nth_seed(seed, len(dense)))]
+        new = left[choose_weighted(weights, names[left], wanted, _nth_seed(seed, len(dense)))]
         free[new] = False
         dense.append(new)
         seconds["choice"] += time.perf_counter() - start
@@ -138,7 +138,7 @@ def choose_dense(
             return samples
 
 
-def weighted_choice(
+def choose_weighted(
     weights: NDArray[np.floating], keys: NDArray[np.uint64], count: int, seed: int
 ) -> NDArray[np.int64]:
     """Draw without replacement, each draw in proportion to the weights of what is left (Efraimidis and Spirakis 2006).
@@ -263,7 +263,7 @@ def _gram(words: NDArray[np.uint64], rows: NDArray[np.int64]) -> NDArray[np.floa
             b = words[rows[j]]
             shared = np.uint64(0)
             for w in range(len(a)):
-                shared += ones(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
+                shared += count_ones(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
             gram[i, j] = gram[j, i] = shared
     return gram
 

@@ -29,7 +29,7 @@ SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 BUMPED = {"NormalMap", "BumpMap"}
 
 
-def kind(bsdf: mi.BSDF) -> str:
+def bsdf_class(bsdf: mi.BSDF) -> str:
     """The class of a BSDF, also of one that is written in Python."""
     own = type(bsdf).__name__
     return own if own != "BSDF" else str(bsdf.class_name())
@@ -68,7 +68,7 @@ class Material:
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; matrices treat its vertices as diffuse "
+                f"shape '{name}': BSDF {bsdf_class(self.bsdf)} {what}; matrices treat its vertices as diffuse "
                 "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
             )
         if self._emitter is not None:

@@ -365,7 +365,7 @@ def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
     mesh = _read(shape, name)
     tessellation.check_geometry(mesh)
     if mesh.normals is not None:
-        mesh = tessellation.settle_normals(mesh, _recomputed_normals(mesh))
+        mesh = tessellation.stabilise_normals(mesh, _recomputed_normals(mesh))
     mesh, dropped = tessellation.drop_degenerate(mesh)
     if dropped:
         notes.append(f"shape '{name}': {dropped} triangles without area are left out")
@@ -374,12 +374,12 @@ def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
         notes.append(f"shape '{name}': {dropped} vertices that no triangle uses are left out")
     if mesh.normals is None:  # Mitsuba shades such meshes flat
         mesh = tessellation.split_by_face(mesh)
-    mesh, zero = tessellation.with_unit_normals(mesh)
+    mesh, zero = tessellation.make_unit_normals(mesh)
     if zero:
         notes.append(
             f"shape '{name}': {zero} vertices have a normal of length zero; it is computed from their faces"
         )
-    return tessellation.flipped(mesh) if shape.has_flipped_normals() else mesh
+    return tessellation.flip_sides(mesh) if shape.has_flipped_normals() else mesh
 
 
 def _recomputed_normals(mesh: TriangleMesh) -> NDArray[np.float32]:

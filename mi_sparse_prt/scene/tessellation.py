@@ -156,7 +156,7 @@ def angle_weighted_normals(mesh: TriangleMesh) -> tuple[NDArray[np.float32], NDA
     return normals.astype(np.float32), np.where(cancelled, np.inf, weight / np.where(cancelled, 1.0, length))
 
 
-def settle_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> TriangleMesh:
+def stabilise_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> TriangleMesh:
     """Normals with the same bits at every load, and none that only the loader's arithmetic spoilt.
 
     Mitsuba computes normals for files that have none, with parallel sums whose order changes from load to
@@ -202,7 +202,7 @@ def split_by_face(mesh: TriangleMesh) -> TriangleMesh:
     return replace(split, normals=face[first // 3].astype(np.float32))
 
 
-def with_unit_normals(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+def make_unit_normals(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Normals of unit length, zero ones computed from the faces; and how many were zero.
 
     Normals that are unit within float32 rounding keep their bits.
@@ -219,7 +219,7 @@ def with_unit_normals(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     return replace(mesh, normals=normals), int(np.sum(zero))
 
 
-def flipped(mesh: TriangleMesh) -> TriangleMesh:
+def flip_sides(mesh: TriangleMesh) -> TriangleMesh:
     """The same surface seen from its other side: normals negated, corners of triangles in the other order."""
     normals = None if mesh.normals is None else -mesh.normals
     return replace(mesh, normals=normals, triangles=np.ascontiguousarray(mesh.triangles[:, [0, 2, 1]]))
@@ -380,7 +380,7 @@ def parametric_mesh(
         keys = np.column_stack([positions, normals]) + np.float32(0)  # -0 and 0 are one
         first, index = _unique_rows(keys)
         mesh = replace(mesh.take_vertices(first, index[triangles]), texcoords=None)
-    return flipped(mesh) if flip else mesh
+    return flip_sides(mesh) if flip else mesh
 
 
 def _too_many(name: str, edge_length: float, limit: int) -> PrtError:

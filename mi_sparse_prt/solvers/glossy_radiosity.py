@@ -24,7 +24,7 @@ from mi_sparse_prt.operators.direct_columns import DirectColumns
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Part
-from mi_sparse_prt.reflection.factor_tables import looked_up
+from mi_sparse_prt.reflection.factor_tables import look_up
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.first_bounce import MIXED
 from mi_sparse_prt.solvers.form_factors import BEHIND, LANES, Surfaces, cosine_rays, sobol
@@ -224,7 +224,7 @@ class Lobes:
         self, table: mi.Float, vertex: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
     ) -> list[mi.Float]:
         material = dr.gather(mi.UInt32, self._material, vertex, valid)
-        return looked_up(table, self._size, self._terms, material, local, valid)
+        return look_up(table, self._size, self._terms, material, local, valid)
 
 
 def _with_dark(tables: Floats) -> mi.Float:

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, counts, listed, lowest
+from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, count_bits, list_bits, lowest_bit
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.emission.texel_adjacency import Sides, TexelSides
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
@@ -73,11 +73,13 @@ def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalV
         block = bits[a : a + BLOCK]
         above = above_horizon(normals[a : a + BLOCK], direct.lighting.directions)
         crossed = sides.crossed(block, above)
-        rows, pairs = listed(crossed)
+        rows, pairs = list_bits(crossed)
         first = sides.tables.first[pairs]
         first_seen = (block[rows, first // BITS] >> (first % BITS).astype(np.uint32)) & np.uint32(1)
         places = _bisected(direct, paths, rows + np.uint32(a), pairs, first_seen)
-        blocks.append(_cut_texels(sides, block, above, Crossings(row_starts(counts(crossed)), pairs, places)))
+        blocks.append(
+            _cut_texels(sides, block, above, Crossings(row_starts(count_bits(crossed)), pairs, places))
+        )
         rays += STEPS * len(pairs)
     seen, number, texels, shares = (np.concatenate(column) for column in zip(*blocks, strict=True))
     return FractionalVisibility(seen, row_starts(number), texels, shares, normals, direct.lighting), rays
@@ -112,7 +114,7 @@ def _cut_texels(
     """Bits, and for each vertex how many texels are seen in part, which, and their shares."""
     horizon = sides.crossed(above, np.full_like(above, 0xFFFFFFFF))
     m = len(sides.tables.beside)
-    room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + counts(horizon), m))
+    room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + count_bits(horizon), m))
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)
     number = np.empty(len(bits), np.int64)
     threads = numba.get_num_threads()
@@ -157,7 +159,7 @@ def _find_shares(
             for w in range(horizon.shape[1]):
                 left = horizon[i, w]
                 while left:
-                    pair = w * BITS + np.int64(lowest(left))  # type: ignore[call-arg]  # numba gives the context
+                    pair = w * BITS + np.int64(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
                     left &= left - np.uint32(1)
                     texel = sides.second[pair] if bit_of(above[i], sides.first[pair]) else sides.first[pair]
                     if done[texel] != i:

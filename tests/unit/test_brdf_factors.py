@@ -10,7 +10,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.reflection.brdf_factors import (
     DirectionGrid,
     diffuse_reflectance,
-    evaluated,
+    evaluate_brdf,
     factor_brdf,
     factor_error,
 )
@@ -86,7 +86,7 @@ def test_a_diffuse_surface_needs_no_terms():
     factors = factor_brdf(bsdf, "wall", 2, SMALL)
     assert factors.diffuse == pytest.approx([0.2, 0.5, 0.7], rel=1e-5)
     wi, wo, _ = pairs(SMALL)
-    assert np.abs(factors.values(wi, wo) - evaluated(bsdf, "wall", wi, wo)).max() < 1e-5
+    assert np.abs(factors.values(wi, wo) - evaluate_brdf(bsdf, "wall", wi, wo)).max() < 1e-5
     assert factor_error(factors, bsdf, "wall").terms_for(1e-3) == 1
 
 
@@ -117,7 +117,7 @@ def test_no_factors_of_that_rank_are_better(kind):
     areas, n = TINY.solid_angles, len(TINY.directions)
     light = light_products(TINY) * areas[:, None] * areas
     seen = np.sqrt(areas * TINY.directions[:, 2])[:, None]
-    true = evaluated(bsdf, "ball", wi, wo).astype(np.float64)
+    true = evaluate_brdf(bsdf, "ball", wi, wo).astype(np.float64)
     for terms in (1, 4, 16):
         factors = factor_brdf(bsdf, "ball", terms, TINY)
         channels = len(factors.diffuse)
@@ -138,7 +138,7 @@ def test_even_light_is_nearly_exact():
     wi, wo, _ = pairs(grid)
     shape = (len(grid.directions), -1)
     true, found = (
-        evaluated(phong(20), "ball", wi, wo)[:, 0].reshape(shape),
+        evaluate_brdf(phong(20), "ball", wi, wo)[:, 0].reshape(shape),
         factors.values(wi, wo).reshape(shape),
     )
     seen = grid.solid_angles * grid.directions[:, 2]
@@ -201,7 +201,7 @@ def test_errors_are_those_of_even_pairs():
     factors = factor_brdf(bsdf, "ball", 6, DirectionGrid(24, 48))
     error = factor_error(factors, bsdf, "ball")
     wi, wo = even_pairs(400_000)
-    true = evaluated(bsdf, "ball", wi, wo)[:, 0].astype(np.float64)
+    true = evaluate_brdf(bsdf, "ball", wi, wo)[:, 0].astype(np.float64)
     for terms in (1, 3, 6):
         missing = factors.first(terms).values(wi, wo)[:, 0] - true
         known = np.sqrt((missing**2).sum() / (true**2).sum())
@@ -226,7 +226,7 @@ def test_held_out_pairs_stand_for_all(kind):
 
     def squares(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
         high = np.minimum(wi[:, 2], wo[:, 2]) > np.sin(np.radians(15))
-        return high * evaluated(bsdf, "ball", wi, wo)[:, 0].astype(np.float64) ** 2
+        return high * evaluate_brdf(bsdf, "ball", wi, wo)[:, 0].astype(np.float64) ** 2
 
     known = squares(*even) * (2 * np.pi**2 / len(even[0]))
     found = squares(*drawn) * weights
@@ -290,7 +290,7 @@ def test_errors_without_the_diffuse_part():
     bsdf, plain = textured("phong", exponent=10.0, specular_reflectance=0.4), phong(10)
     lobe, whole = (factor_error(factor_brdf(b, "wall", 3, SMALL), b, "wall").whole for b in (bsdf, plain))
     wi, wo = even_pairs(1 << 17)
-    true = evaluated(plain, "wall", wi, wo)[:, 0].astype(np.float64)
+    true = evaluate_brdf(plain, "wall", wi, wo)[:, 0].astype(np.float64)
     ratio = np.sqrt((true**2).sum() / ((true - 0.3 * wi[:, 2] / np.pi) ** 2).sum())
     assert lobe == pytest.approx(whole * ratio, rel=0.03)
 

@@ -7,7 +7,7 @@ from mi_sparse_prt import CubemapLighting
 from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.sampling import consensus
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.consensus import STRIDES, Consensus, Surface, by_levels
+from mi_sparse_prt.sampling.consensus import STRIDES, Consensus, Surface, sample_by_levels
 
 LIGHTING = CubemapLighting(16)
 GRID = AngularGrid(LIGHTING)
@@ -48,7 +48,7 @@ class Plane:
 
     def state(self) -> Consensus:
         state = Consensus(self.normals, GRID, self.trace)
-        by_levels(state, self.surface())
+        sample_by_levels(state, self.surface())
         return state
 
 

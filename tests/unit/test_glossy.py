@@ -8,7 +8,7 @@ from conftest import build, diffuse
 import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.operators.direct_columns import DirectColumns
-from mi_sparse_prt.reflection.frames import frames, orthogonal
+from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
 
@@ -173,7 +173,7 @@ def test_tangents_are_orthogonal_to_normals() -> None:
     along = np.concatenate([rng.normal(size=(30, 3)), normals[30:]]).astype(
         np.float32
     )  # the last ones have none
-    turn = frames(orthogonal(along, normals), normals)
+    turn = frames(orthogonalise(along, normals), normals)
     np.testing.assert_allclose(
         turn @ np.moveaxis(turn, 1, 2), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5
     )

@@ -16,9 +16,9 @@ from mi_sparse_prt.sampling.spatial import (
     ROUNDING,
     SHARING,
     choose_dense,
+    choose_weighted,
     local_rank,
     local_ranks_at,
-    weighted_choice,
 )
 
 
@@ -122,7 +122,7 @@ def test_ranks_are_those_of_the_dense_rows_within_the_radius():
 
 def test_single_draws_are_in_proportion_to_the_weights():
     weights, keys = np.array([1.0, 2, 3, 4]), np.arange(4, dtype=np.uint64)
-    drawn = [int(weighted_choice(weights, keys, 1, seed)[0]) for seed in range(4000)]
+    drawn = [int(choose_weighted(weights, keys, 1, seed)[0]) for seed in range(4000)]
     assert chisquare(np.bincount(drawn), 4000 * weights / weights.sum()).pvalue > 1e-3
 
 
@@ -136,14 +136,14 @@ def test_draws_without_replacement_have_their_probabilities():
         + weights[j] / total * weights[i] / (total - weights[j])
         for i, j in pairs
     ]
-    drawn = [pairs.index(tuple(weighted_choice(weights, keys, 2, seed))) for seed in range(6000)]
+    drawn = [pairs.index(tuple(choose_weighted(weights, keys, 2, seed))) for seed in range(6000)]
     assert chisquare(np.bincount(drawn, minlength=6), 6000 * np.array(p)).pvalue > 1e-3
 
 
 def test_keys_draw_independently():
     """One seed, many keys: within four standard errors of an even draw, in every corner of the keys."""
     n, count = 20000, 5000
-    chosen = weighted_choice(np.ones(n), np.arange(n, dtype=np.uint64), count, 3)
+    chosen = choose_weighted(np.ones(n), np.arange(n, dtype=np.uint64), count, 3)
     share = np.bincount(chosen // 2000, minlength=10) / 2000
     assert np.abs(share - 0.25).max() < 4 * np.sqrt(0.25 * 0.75 / 2000)
 
@@ -158,11 +158,11 @@ def test_keys_draw_independently():
 def test_choice_in_any_order(weights, count, seed, random):
     n = len(weights)
     keys = mix(np.arange(n, dtype=np.uint64))
-    chosen = weighted_choice(weights, keys, count, seed)
+    chosen = choose_weighted(weights, keys, count, seed)
     assert len(chosen) == len(set(chosen)) == min(max(count, 0), n)
     assert (np.diff(chosen) > 0).all()
     order = np.array(random.sample(range(n), n), int)
-    again = weighted_choice(weights[order], keys[order], count, seed)
+    again = choose_weighted(weights[order], keys[order], count, seed)
     assert np.array_equal(np.sort(keys[chosen]), np.sort(keys[order][again]))
     # weight 0 only when nothing else is left
     assert (weights[chosen] > 0).sum() == min(len(chosen), (weights > 0).sum())
@@ -170,14 +170,14 @@ def test_choice_in_any_order(weights, count, seed, random):
 
 def test_zero_weights_are_drawn_at_random():
     keys = np.arange(3, dtype=np.uint64)
-    drawn = [int(weighted_choice(np.zeros(3), keys, 1, seed)[0]) for seed in range(3000)]
+    drawn = [int(choose_weighted(np.zeros(3), keys, 1, seed)[0]) for seed in range(3000)]
     assert chisquare(np.bincount(drawn, minlength=3)).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("bad", [-1, np.nan, np.inf])
 def test_impossible_weights(bad):
     with pytest.raises(PrtError, match="vertex 1 has the weight"):
-        weighted_choice(np.array([1, bad]), np.arange(2, dtype=np.uint64), 1, 0)
+        choose_weighted(np.array([1, bad]), np.arange(2, dtype=np.uint64), 1, 0)
 
 
 # --- Choice of dense vertices -----------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ def tetrahedron(flip: bool = False) -> ts.TriangleMesh:
     p = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
     t = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32)
     mesh = ts.TriangleMesh("tetrahedron", p, p / np.float32(np.sqrt(3)), t)
-    return ts.flipped(mesh) if flip else mesh
+    return ts.flip_sides(mesh) if flip else mesh
 
 
 def square() -> ts.TriangleMesh:
@@ -274,13 +274,13 @@ def test_normals_computed_by_the_loader_are_settled_and_others_kept() -> None:
     recomputed = own.copy()
     loaded[1] = recomputed[1] = np.nan  # a corner of a triangle without area
     loaded[2] = [0, 1, 0]  # the file's own
-    settled = ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+    settled = ts.stabilise_normals(ts.replace(mesh, normals=loaded), recomputed)
     np.testing.assert_array_equal(settled.normals[[0, 1, 3]], own[[0, 1, 3]])
     np.testing.assert_array_equal(settled.normals[2], [0, 1, 0])
 
     loaded[3] = np.nan
     with pytest.raises(PrtError, match=r"'tetrahedron': vertex 3 has a normal that is zero or not finite"):
-        ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+        ts.stabilise_normals(ts.replace(mesh, normals=loaded), recomputed)
 
 
 def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
@@ -288,7 +288,7 @@ def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
     mesh.normals = mesh.normals.copy()
     mesh.normals[1] *= 3
     mesh.normals[2] = 0
-    unit, zero = ts.with_unit_normals(mesh)
+    unit, zero = ts.make_unit_normals(mesh)
     assert zero == 1
     np.testing.assert_array_equal(unit.normals[[0, 3]], mesh.normals[[0, 3]])
     np.testing.assert_allclose(unit.normals, tetrahedron().normals, atol=1e-6)

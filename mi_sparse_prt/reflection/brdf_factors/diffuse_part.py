@@ -15,7 +15,7 @@ from mi_sparse_prt.reflection.brdf_factors.direction_grid import (
     Doubles,
     Floats,
 )
-from mi_sparse_prt.scene.materials import kind
+from mi_sparse_prt.scene.materials import bsdf_class
 
 DARKEST = 0.05  # cosine of directions that tell the diffuse part: below, Fresnel terms have their say
 PLACES = 256  # texture coordinates at which a BSDF is looked at
@@ -59,7 +59,7 @@ class GlossyPart:
         w = DirectionGrid(HEIGHTS // 4, AZIMUTHS // 4).directions
         w = w[w[:, 2] > DARKEST]
         incident, outgoing = np.repeat(w, len(w), axis=0), np.tile(w, (len(w), 1))
-        value = evaluated(bsdf, name, incident, outgoing)
+        value = evaluate_brdf(bsdf, name, incident, outgoing)
         least = np.pi * (value / incident[:, 2:]).min(axis=0).astype(np.float64)
         coloured = value - incident[:, 2:] * least / np.pi if self.varying_diffuse else value
         grey = np.ptp(coloured, axis=1).max() <= 1e-6 * max(float(value.max()), 1e-30)
@@ -68,7 +68,7 @@ class GlossyPart:
 
     def values(self, incident: Floats, outgoing: Floats) -> Floats:
         """Glossy BRDF times the incident cosine, (m, channels), at pairs of directions (m, 3)."""
-        value = evaluated(self._bsdf, self._name, incident, outgoing)[:, : self.channels]
+        value = evaluate_brdf(self._bsdf, self._name, incident, outgoing)[:, : self.channels]
         cosine = np.where(outgoing[:, 2] > 0, np.maximum(incident[:, 2], 0), 0)
         dull = cosine[:, None] * (self.diffuse[: self.channels] / np.pi).astype(np.float32)
         part: Floats = value - dull
@@ -98,13 +98,13 @@ def diffuse_reflectance(bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f) -
     part = GlossyPart(bsdf, name)
     back = np.array([SLANTED], np.float32)
     here = np.broadcast_to(back, (dr.width(si), 3))
-    there = evaluated(bsdf, name, back, back)
+    there = evaluate_brdf(bsdf, name, back, back)
     change = _at(bsdf, name, mi.SurfaceInteraction3f(si), here, here) - there
     found: Floats = np.maximum(part.diffuse + change * (np.pi / SLANTED[2]), 0).astype(np.float32)
     return found
 
 
-def evaluated(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> Floats:
+def evaluate_brdf(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> Floats:
     """BRDF times the incident cosine, (m, 3), at pairs of directions (m, 3) in the local frame.
 
     Textures are looked at where their coordinates are (0, 0).
@@ -118,7 +118,7 @@ def evaluated(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> F
 
 
 def _at(bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f, incident: Floats, outgoing: Floats) -> Floats:
-    """As `evaluated`, at places, whose directions are overwritten."""
+    """As `evaluate_brdf`, at places, whose directions are overwritten."""
     si.wi = mi.Vector3f(np.ascontiguousarray(outgoing.T))  # Mitsuba's wi is where the light leaves for
     light = mi.Vector3f(np.ascontiguousarray(incident.T))
     value = np.array(dr.zeros(mi.Color3f, len(incident)) + bsdf.eval(mi.BSDFContext(), si, light)).T
@@ -149,7 +149,7 @@ def _check(bsdf: mi.BSDF, name: str) -> bool:
             problem = "varies over the surface in more than a Lambertian reflectance"
     if problem:
         raise PrtError(
-            f"shape '{name}': BSDF {kind(bsdf)} {problem}, which factors of a BRDF cannot; "
+            f"shape '{name}': BSDF {bsdf_class(bsdf)} {problem}, which factors of a BRDF cannot; "
             "use path tracing instead"
         )
     return varies
@@ -159,7 +159,7 @@ def _variation(bsdf: mi.BSDF, name: str) -> tuple[bool, bool]:
     """Whether texture coordinates make a difference, which flags do not always tell, and if so, whether it is
     Lambertian: alike for all pairs of directions.
     """
-    incident, outgoing = probes()
+    incident, outgoing = probe_directions()
     uv = np.random.default_rng(0).random((2, PLACES), np.float32)
     uv[:, 0] = 0
     si = dr.zeros(mi.SurfaceInteraction3f, PLACES * len(incident))
@@ -173,15 +173,15 @@ def _variation(bsdf: mi.BSDF, name: str) -> tuple[bool, bool]:
     return bool((np.abs(change) > rounding).any()), bool(alike.all())
 
 
-def anisotropic(bsdf: mi.BSDF, name: str) -> bool:
+def is_anisotropic(bsdf: mi.BSDF, name: str) -> bool:
     """Whether a BRDF changes when both directions are turned about the normal."""
-    incident, outgoing = probes()
-    value = evaluated(bsdf, name, incident, outgoing)
-    turned = evaluated(bsdf, name, incident @ TURNED, outgoing @ TURNED)
+    incident, outgoing = probe_directions()
+    value = evaluate_brdf(bsdf, name, incident, outgoing)
+    turned = evaluate_brdf(bsdf, name, incident @ TURNED, outgoing @ TURNED)
     return bool((np.abs(turned - value) > UNLIKE * np.abs(value).max()).any())
 
 
-def probes() -> tuple[Floats, Floats]:
+def probe_directions() -> tuple[Floats, Floats]:
     """Pairs of directions (3 * PROBES, 3), incident and outgoing: at the highlight, beside it, and anywhere."""
     rng = np.random.default_rng(0)
     outgoing, other = (_high(rng, PROBES) for _ in range(2))

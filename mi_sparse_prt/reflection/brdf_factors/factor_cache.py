@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.io.atomic import write_atomically
 from mi_sparse_prt.io.cache_folder import cache_folder
-from mi_sparse_prt.reflection.brdf_factors.diffuse_part import evaluated, probes
+from mi_sparse_prt.reflection.brdf_factors.diffuse_part import evaluate_brdf, probe_directions
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
 from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
@@ -94,7 +94,7 @@ def _key(bsdf: mi.BSDF, name: str, grid: DirectionGrid) -> str:
     carrier = mi.load_dict({"type": "rectangle", "bsdf": bsdf})  # what materials are read from
     shown = Material(carrier, name, []).digest()
     state = hashlib.sha256(json.dumps([FORMAT, MOST_TERMS, grid.heights, grid.azimuths]).encode())
-    state.update(shown + evaluated(bsdf, name, *probes()).tobytes())
+    state.update(shown + evaluate_brdf(bsdf, name, *probe_directions()).tobytes())
     return state.hexdigest()[:32]
 
 

@@ -151,10 +151,10 @@ def factor_brdf(
     grid = grid or DirectionGrid()
     into, out = _weights(grid)
     left, right = _factored(_weighted(part, grid), _light(grid), terms, seed)
-    return made_of(part, grid, left.T / into, right.reshape(len(right), part.channels, -1) / out)
+    return join_factors(part, grid, left.T / into, right.reshape(len(right), part.channels, -1) / out)
 
 
-def made_of(part: GlossyPart, grid: DirectionGrid, incident: Doubles, outgoing: Doubles) -> BrdfFactors:
+def join_factors(part: GlossyPart, grid: DirectionGrid, incident: Doubles, outgoing: Doubles) -> BrdfFactors:
     """Factors (K, grid) and (K, channels, grid) of a glossy part, with the diffuse one unless that varies."""
     diffuse = part.diffuse[: part.channels] * (not part.varying_diffuse)
     f, g = incident.astype(np.float32), outgoing.astype(np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, Doubles
-from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors, glossy_rows, made_of
+from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors, glossy_rows, join_factors
 
 HIGHEST = 12  # order: 169 terms
 
@@ -56,7 +56,7 @@ def harmonic_factors(bsdf: mi.BSDF, name: str, order: int, grid: DirectionGrid |
     fit = np.zeros((len(basis), part.channels * n))
     for some, values in glossy_rows(part, grid):
         fit += (basis[:, some] * roots[some]).astype(np.float32) @ values.reshape(-1, fit.shape[1])
-    return made_of(part, grid, basis / roots, fit.reshape(len(basis), -1, n))
+    return join_factors(part, grid, basis / roots, fit.reshape(len(basis), -1, n))
 
 
 def _orthonormal(grid: DirectionGrid, order: int) -> Doubles:
