@@ -32,7 +32,7 @@ from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import choose_features
-from mi_sparse_prt.sampling.spatial import choose_dense, choose_weighted
+from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense, choose_weighted
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -177,9 +177,8 @@ def compare_choices(
         raise PrtError(f"n_vertices is {n_vertices}: give 1 or more")
     surface = _surface(scene, lighting, mesh)
     n, count = len(surface.positions), max(1, round(SHARE * lighting.n_directions))
-    by_rank = choose_dense(
-        surface.positions, surface.keys, lambda ids: surface.bits[ids], ROWS, radius=RADIUS, seed=seed
-    ).ids
+    sampling = SpatialSampling(ROWS, radius=RADIUS)
+    by_rank = choose_dense(surface.positions, surface.keys, lambda ids: surface.bits[ids], sampling, seed).ids
     at_random = choose_weighted(np.ones(n), surface.keys, len(by_rank), seed + 1)
     sample = choose_weighted(np.ones(n), surface.keys, n_vertices, seed + 2)
     norms = (surface.rows(sample).astype(np.float64) ** 2).sum(axis=1)

@@ -34,7 +34,6 @@ FACE_FRAMES = np.array(
     ],
     dtype=np.float64,
 )
-SAMPLES_PER_BLOCK = 1 << 20  # directions at which an emitter is evaluated at once: about 100 MB
 
 
 class CubemapLighting:
@@ -220,7 +219,7 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
         )
     n = lighting.resolution
     s = _samples_per_edge(emitter, n)
-    block = max(1, SAMPLES_PER_BLOCK // s**2)
+    block = max(1, (1 << 20) // s**2)  # a million directions at once: about 100 MB
     radiance = np.empty((lighting.n_directions, 3))  # [texel, rgb]
     for start in range(0, lighting.n_directions, block):
         texels = np.arange(start, min(start + block, lighting.n_directions))

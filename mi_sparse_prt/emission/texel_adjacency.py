@@ -19,7 +19,6 @@ from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-_BEYOND = 1.01  # half texels: just beyond a side
 
 Ints = NDArray[np.int32]
 
@@ -131,8 +130,9 @@ def _points(lighting: CubemapLighting, dx: float, dy: float) -> NDArray[np.float
 def _beyond(lighting: CubemapLighting, dx: int, dy: int) -> Ints:
     """The texel beyond a side or a corner of each, -1 beyond a corner of the cube."""
     _, s, t = _grid(lighting)
-    texels = lighting.texel_of(_points(lighting, _BEYOND * dx, _BEYOND * dy))
-    outside = [np.abs(x + _BEYOND * d / lighting.resolution) > 1 for x, d in ((s, dx), (t, dy))]
+    step = 1.01  # half texels: just beyond a side
+    texels = lighting.texel_of(_points(lighting, step * dx, step * dy))
+    outside = [np.abs(x + step * d / lighting.resolution) > 1 for x, d in ((s, dx), (t, dy))]
     return np.where(outside[0] & outside[1], -1, texels).astype(np.int32)
 
 

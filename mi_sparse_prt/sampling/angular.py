@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, list_bits, lowest_bit, pack, scatter_bits
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
 
-RADIUS = 3  # texels: windows of 7 x 7
-
 
 @dataclass(frozen=True)
 class DenseRows:
@@ -49,6 +47,8 @@ class AngularGrid:
     Parameters
     ----------
     lighting : CubemapLighting
+    radius : int
+        Of the windows, in texels; 3 are the 7 x 7 of [HR10] Figure 3.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class AngularGrid:
         Every second texel per axis, n_directions / 4 of them (all at resolution 1).
     """
 
-    def __init__(self, lighting: CubemapLighting) -> None:
-        self.lighting = lighting
+    def __init__(self, lighting: CubemapLighting, radius: int = 3) -> None:
+        self.lighting, self._radius = lighting, radius
         n = lighting.resolution
         self._face, self._row, self._column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
         self._sampled = (self._row % 2 == 0) & (self._column % 2 == 0)
@@ -92,8 +92,9 @@ class AngularGrid:
         Windows continue across the edges of the cube on the plane of the texel's own face.
         """
         columns = []
-        for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
+        steps = range(-self._radius, self._radius + 1)
+        for dy in steps:
+            for dx in steps:
                 texels, inside = self._shifted(dx, dy)
                 columns.append(np.where(self._sampled[texels] & inside, texels, -1))
         table = np.sort(np.stack(columns, axis=1), axis=1)[:, ::-1]  # [texel, place], -1 last

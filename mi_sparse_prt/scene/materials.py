@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.tessellation import TriangleMesh
 
-#: Samples per vertex for the directional albedo of a BSDF that is not diffuse (stratified, 8 x 8).
-ALBEDO_STRATA = 8
-
 #: BSDFs and textures that do not vary over the surface nor with its rotation.
 PLAIN = {"SmoothDiffuse", "TwoSided", "UniformSpectrum", "SRGBReflectanceSpectrum"}
 
@@ -125,7 +122,7 @@ class Material:
         """The share of light from the normal's direction that is scattered: a mean of stratified samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
-        n = ALBEDO_STRATA
+        n = 8  # strata per axis
         for k in range(n * n):
             # The lobe's random number runs in bit-reversed order, so that each lobe sees the whole square.
             lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n

@@ -15,19 +15,9 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 
-#: A triangle whose area is below this times the square of its longest edge is a line to float32.
-DEGENERATE = 1e-9
-
 #: Edges longer by this share than asked for are still accepted, so that ties (a square's diagonal is a power
 #: of two of its default edge) do not depend on how float32 rounds a scene that was scaled or moved.
 TIE = 0.01
-
-#: Normals that agree to this (times the cancellation in their sum) with those that Mitsuba computes were
-#: computed by it: its parallel sums differ by 2e-7 from load to load.
-COMPUTED = 1e-5
-
-#: A curved shape gets at least this many segments around, whatever the edge length.
-MIN_SEGMENTS = 32
 
 
 @dataclass
@@ -112,7 +102,7 @@ def drop_degenerate(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     p = mesh.positions.astype(np.float64)[mesh.triangles]
     longest = np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2), axis=1, initial=0.0)
     twice_area = np.linalg.norm(triangle_normals(mesh), axis=1)
-    keep = twice_area > DEGENERATE * longest
+    keep = twice_area > 1e-9 * longest  # smaller ones are lines to float32
     return (mesh, 0) if keep.all() else (mesh.take_triangles(keep), int(np.sum(~keep)))
 
 
@@ -175,9 +165,12 @@ def stabilise_normals(mesh: TriangleMesh, recomputed: NDArray[np.float32]) -> Tr
     """
     assert mesh.normals is not None
     own, cancellation = angle_weighted_normals(mesh)
+    # Normals that agree to this (times the cancellation in their sum) with those that Mitsuba computes were computed by
+    # it: its parallel sums differ by 2e-7 from load to load.
+    agreement = 1e-5
     lost = ~np.isfinite(mesh.normals).all(axis=1)
     with np.errstate(invalid="ignore"):
-        near = np.max(np.abs(mesh.normals - recomputed), axis=1) <= COMPUTED * cancellation
+        near = np.max(np.abs(mesh.normals - recomputed), axis=1) <= agreement * cancellation
     computed = np.where(lost, ~np.isfinite(recomputed).all(axis=1) | np.isinf(cancellation), near)
     bad = np.flatnonzero(lost & ~computed)
     if bad.size:
@@ -350,15 +343,15 @@ def parametric_mesh(
             f"shape '{name}': the to_world of a {shape} must not shear it or scale it unevenly: "
             "use a mesh instead"
         )
-    radius = max(scale[0], scale[1])
-    around = 4 * max(MIN_SEGMENTS // 4, _segments(np.pi / 2 * radius, edge_length))
+    radius, fewest = max(scale[0], scale[1]), 32  # segments around, whatever the edge length
+    around = 4 * max(fewest // 4, _segments(np.pi / 2 * radius, edge_length))
     # `angle` is the axis of (u, v) that runs around, `across` counts along the other one, `poles` are its ends
     # where circles shrink to points.
     surface: Parametrisation
     poles: tuple[int, ...]
     if shape == "sphere":
         surface, angle, poles = _sphere, 0, (0, 1)
-        across = 2 * max(MIN_SEGMENTS // 4, _segments(np.pi / 2 * radius, edge_length))
+        across = 2 * max(fewest // 4, _segments(np.pi / 2 * radius, edge_length))
     elif shape == "disk":
         surface, angle, poles, across = _disk, 1, (0,), _segments(radius, edge_length)
     else:

@@ -56,7 +56,7 @@ class ReferenceMatrix:
             }
         )
         self._sensor = self._scene.sensors()[0]
-        self._sensor.bind(self._scene, rays.chosen(vertices))
+        self._sensor.bind(self._scene, rays.take(vertices))
         self._parameters = mi.traverse(self._scene)
         self._lighting, self._basis = lighting, basis
 

@@ -5,9 +5,7 @@ import pytest
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reconstruction import denoising
-from mi_sparse_prt.reconstruction.denoising import denoise_rows as factored
-from mi_sparse_prt.reconstruction.denoising import smooth_rows
+from mi_sparse_prt.reconstruction.denoising import DenoisingOptions, denoise_rows, smooth_rows
 
 R = 4
 LONG = 600  # the longer side of matrices whose error is predicted
@@ -29,9 +27,9 @@ def noisy(
     return (clean + noise).astype(np.float32), (deviation**2).astype(np.float32)
 
 
-def denoise_rows(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
     """The matrix and its rank."""
-    found = factored(rows, variance)
+    found = denoise_rows(rows, variance)
     return found.matrix(), found.rank
 
 
@@ -57,7 +55,7 @@ def test_the_error_falls_as_predicted(n, m, strength):
     """Noise of deviation 1 on rank 4: the squared error falls to about 4 (1 + beta) / 600 beta of what it was."""
     clean = truth(n, m, strength)
     rows, variance = noisy(clean, 1.0)
-    ours, rank = denoise_rows(rows, variance)
+    ours, rank = denoised(rows, variance)
     assert ours.dtype == np.float32
     assert ours.shape == rows.shape
     assert R <= rank <= R + 1
@@ -71,7 +69,7 @@ def test_it_is_shrinkage_and_not_a_cut():
     """Close to the threshold, keeping the four largest singular values as they are is worse."""
     clean = truth(400, 400, 1.2)
     rows, variance = noisy(clean, 1.0)
-    ours, _ = denoise_rows(rows, variance)
+    ours, _ = denoised(rows, variance)
     u, s, vt = np.linalg.svd(rows.astype(np.float64), full_matrices=False)
     assert error(ours, clean) < 0.9 * error((u[:, :R] * s[:R]) @ vt[:R], clean)
 
@@ -86,15 +84,15 @@ def test_against_the_singular_values_of_numpy():
         eta = np.sqrt(np.maximum((y2 - beta - 1) ** 2 - 4 * beta, 0) / y2)
         eta[y2 <= (1 + np.sqrt(beta)) ** 2] = 0
         expected = 0.5 * (u * eta * np.sqrt(long)) @ vt
-        ours, rank = denoise_rows(rows, variance)
+        ours, rank = denoised(rows, variance)
         assert rank == (eta > 0).sum()
         assert error(ours, expected) < 1e-4 * np.linalg.norm(expected)
 
 
 def test_wide_and_tall_are_transposes():
     rows, variance = noisy(truth(200, 90), 1.0)
-    tall, tall_rank = denoise_rows(rows, variance)
-    wide, wide_rank = denoise_rows(np.ascontiguousarray(rows.T), np.ascontiguousarray(variance.T))
+    tall, tall_rank = denoised(rows, variance)
+    wide, wide_rank = denoised(np.ascontiguousarray(rows.T), np.ascontiguousarray(variance.T))
     assert tall_rank == wide_rank
     assert error(wide.T, tall) < 1e-5 * np.linalg.norm(tall)
 
@@ -102,14 +100,14 @@ def test_wide_and_tall_are_transposes():
 def test_without_noise_nothing_changes():
     """One path per element: its variance is not known, and the estimates are all there is."""
     rows = np.random.default_rng(0).random((20, 30)).astype(np.float32)
-    ours, _ = denoise_rows(rows, np.zeros_like(rows))
+    ours, _ = denoised(rows, np.zeros_like(rows))
     assert np.array_equal(ours, rows)
 
 
 def test_noise_that_is_too_small_to_matter_changes_nothing():
     clean = truth(80, 50)
     rows, variance = noisy(clean, 1e-6)
-    ours, _ = denoise_rows(rows, variance)
+    ours, _ = denoised(rows, variance)
     assert error(ours, rows) < 1e-5 * np.linalg.norm(rows)
 
 
@@ -117,7 +115,7 @@ def test_noise_that_is_too_small_to_matter_changes_nothing():
 def test_pure_noise_is_dropped(n, m):
     for seed in range(5):
         rows, variance = noisy(np.zeros((n, m)), 1.0, seed)
-        ours, rank = denoise_rows(rows, variance)
+        ours, rank = denoised(rows, variance)
         assert rank <= 2  # the largest one may rise above its limit for large matrices
         assert np.linalg.norm(ours) < 0.1 * np.linalg.norm(rows)
 
@@ -129,8 +127,8 @@ def test_rows_of_different_noise():
     deviation = np.geomspace(0.03, 30, 300)[:, None]
     clean = truth(300, 200, 3)
     rows, variance = noisy(clean, deviation)
-    ours, rank = denoise_rows(rows, variance)
-    blind, _ = denoise_rows(rows, np.full_like(variance, variance.mean()))
+    ours, rank = denoised(rows, variance)
+    blind, _ = denoised(rows, np.full_like(variance, variance.mean()))
     assert R <= rank <= R + 2
     assert error(ours, clean) < 0.2 * error(rows, clean)
     assert error(ours, clean) < 0.8 * error(blind, clean)
@@ -145,7 +143,7 @@ def test_a_row_without_noise_is_kept():
     deviation = np.ones((100, 1))
     deviation[[3, 50]] = 0
     rows, variance = noisy(clean, deviation)
-    ours, _ = denoise_rows(rows, variance)
+    ours, _ = denoised(rows, variance)
     assert np.isfinite(ours).all()
     assert error(ours[[3, 50]], clean[[3, 50]]) < 0.01 * np.linalg.norm(clean[[3, 50]])
     assert error(ours, clean) < 0.5 * error(rows, clean)
@@ -156,14 +154,14 @@ def test_dark_rows_stay_dark():
     clean[10:40] = 0
     deviation = np.ones((100, 1))
     deviation[10:40] = 0
-    ours, _ = denoise_rows(*noisy(clean, deviation))
+    ours, _ = denoised(*noisy(clean, deviation))
     assert np.abs(ours[10:40]).max() < 1e-3 * np.abs(clean).max()
 
 
 def test_all_zero():
     zero = np.zeros((30, 20), np.float32)
     for variance in (zero, zero + 1):
-        ours, _ = denoise_rows(zero, variance)
+        ours, _ = denoised(zero, variance)
         assert np.array_equal(ours, zero)
 
 
@@ -171,7 +169,7 @@ def test_all_zero():
 def test_small_shapes(shape):
     rows = np.random.default_rng(0).random(shape).astype(np.float32)
     for variance in (np.zeros_like(rows), np.full_like(rows, 1e-6)):
-        ours, _ = denoise_rows(rows, variance)
+        ours, _ = denoised(rows, variance)
         assert ours.shape == shape
         assert np.isfinite(ours).all()
         assert error(ours, rows) <= 0.02 * np.linalg.norm(rows)
@@ -180,8 +178,8 @@ def test_small_shapes(shape):
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
 def test_units_do_not_matter(scale):
     clean = truth(120, 80)
-    one, rank = denoise_rows(*noisy(clean, 1.0))
-    other, other_rank = denoise_rows(*noisy(clean * scale, scale))
+    one, rank = denoised(*noisy(clean, 1.0))
+    other, other_rank = denoised(*noisy(clean * scale, scale))
     assert rank == other_rank
     assert error(other / scale, one) < 1e-4 * np.linalg.norm(one)
 
@@ -194,7 +192,7 @@ def test_never_nan():
         n, m = rng.integers(1, 30, 2)
         deviation = 10.0 ** rng.integers(-8, 8, (n, 1)) * (rng.random((n, 1)) < 0.7)
         clean = 10.0 ** rng.integers(-8, 8, (n, 1)) * rng.random((n, m)) * (rng.random((n, 1)) < 0.7)
-        ours, rank = denoise_rows(*noisy(clean, deviation, int(rng.integers(1000))))
+        ours, rank = denoised(*noisy(clean, deviation, int(rng.integers(1000))))
         assert np.isfinite(ours).all()
         assert 0 <= rank <= min(n, m)
 
@@ -202,7 +200,7 @@ def test_never_nan():
 def test_arguments_stay_as_they_are():
     rows, variance = noisy(truth(40, 30), 1.0)
     copies = rows.copy(), variance.copy()
-    denoise_rows(rows, variance)
+    denoised(rows, variance)
     assert np.array_equal(rows, copies[0])
     assert np.array_equal(variance, copies[1])
 
@@ -225,7 +223,7 @@ def on_a_ring(n: int, m: int, steps: int) -> NDArray[np.float64]:
 def test_smooth_rows_are_smoothed():
     """A mean of three has 0.58 of the noise; not knowing that rows are smooth costs some of that."""
     clean = on_a_ring(300, 80, 0)
-    found = factored(*noisy(clean, 1.0))
+    found = denoise_rows(*noisy(clean, 1.0))
     better = smooth_rows(found, smoothing(300))
     before, after = (error(x.matrix(), clean) for x in (found, better))
     assert after < 0.8 * before
@@ -235,7 +233,7 @@ def test_smooth_rows_are_smoothed():
 def test_what_is_local_survives_smoothing():
     """Rows that differ from their neighbours by more than noise: smoothing alone would ruin them."""
     clean = on_a_ring(300, 80, 6)
-    found = factored(*noisy(clean, 0.1))
+    found = denoise_rows(*noisy(clean, 0.1))
     plain = (smoothing(300) @ found.left) @ found.right
     ours = smooth_rows(found, smoothing(300)).matrix()
     assert error(ours, clean) < 1.02 * error(found.matrix(), clean)
@@ -249,7 +247,7 @@ def test_the_noise_of_rows_is_known():
     deviation = np.geomspace(0.5, 2, 400)[:, None]
     found, expected = np.zeros(400), np.zeros(400)
     for seed in range(8):
-        run = factored(*noisy(clean, deviation, seed))
+        run = denoise_rows(*noisy(clean, deviation, seed))
         found += (((run.matrix() - clean) @ span) ** 2).sum(axis=1)
         expected += run.noise * (run.right**2).sum(axis=1).mean()
     for half in (slice(0, 200), slice(200, 400)):
@@ -259,7 +257,7 @@ def test_the_noise_of_rows_is_known():
 
 def test_without_noise_nothing_is_smoothed():
     rows = np.random.default_rng(0).random((30, 20)).astype(np.float32)
-    found = smooth_rows(factored(rows, np.zeros_like(rows)), smoothing(30))
+    found = smooth_rows(denoise_rows(rows, np.zeros_like(rows)), smoothing(30))
     assert np.array_equal(found.matrix(), rows)
 
 
@@ -269,17 +267,16 @@ def test_smoothing_rows_some_of_which_have_no_noise():
     clean[40:80] = 0
     deviation = np.ones((120, 1))
     deviation[40:80] = 0
-    found = smooth_rows(factored(*noisy(clean, deviation)), smoothing(120))
+    found = smooth_rows(denoise_rows(*noisy(clean, deviation)), smoothing(120))
     assert np.isfinite(found.matrix()).all()
     assert np.abs(found.matrix()[45:75]).max() < 1e-2 * np.abs(clean).max()
 
 
-def test_many_values_above_the_noise_are_found_exactly(monkeypatch):
+def test_many_values_above_the_noise_are_found_exactly():
     """The sketch gives up when it is full."""
     rows, variance = noisy(truth(600, 300, 3), 1.0)
-    sketched = factored(rows, variance)
-    monkeypatch.setattr(denoising, "SKETCH", R)
-    exact = factored(rows, variance)
+    sketched = denoise_rows(rows, variance)
+    exact = denoise_rows(rows, variance, DenoisingOptions(sketch=R))
     assert sketched.rank >= R
     assert exact.rank >= sketched.rank
     assert error(sketched.matrix(), exact.matrix()) < 1e-2 * np.linalg.norm(exact.matrix())

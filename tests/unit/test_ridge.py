@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mi_sparse_prt.reconstruction.ridge import (
-    DEVIATIONS,
+    RidgeOptions,
     System,
     choose_deviation,
     fit_correction,
@@ -12,6 +12,7 @@ from mi_sparse_prt.reconstruction.ridge import (
 )
 
 N, K, S = 400, 5, 60
+DEVIATIONS = RidgeOptions().deviations
 
 
 def samples(
