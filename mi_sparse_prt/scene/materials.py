@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.tessellation import TriangleMesh
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 #: BSDFs and textures that do not vary over the surface nor with its rotation.
 PLAIN = {"SmoothDiffuse", "TwoSided", "UniformSpectrum", "SRGBReflectanceSpectrum"}

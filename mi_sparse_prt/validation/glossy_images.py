@@ -32,7 +32,8 @@ from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.relighting.image import background_emitter, render
-from mi_sparse_prt.scene.scene import Scene, watertight_scene
+from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
+from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.validation import matrix_figures as draw
 
