@@ -241,7 +241,7 @@ class GlossyTransport:
         for number, factors in enumerate(self.factors):
             own = np.flatnonzero(self.material == number)
             local = np.einsum("nij,nj->ni", turn[own], towards[own])
-            g = factors.grid.interpolated(factors.outgoing, local)  # [term, channel, vertex]
+            g = factors.grid.interpolate(factors.outgoing, local)  # [term, channel, vertex]
             lobes = np.broadcast_to(g, (len(g), 3, len(own)))
             radiance[own] += np.einsum("kcn,nkc->nc", lobes, found.terms[own][:, : len(g)])
         above = np.einsum("nd,nd->n", towards, self.normals) > 0

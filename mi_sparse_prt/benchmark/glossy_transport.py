@@ -18,7 +18,7 @@ from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.precompute import precompute
-from mi_sparse_prt.reflection.brdf_factors import factor_error
+from mi_sparse_prt.reflection.brdf_factors import measure_factor_error
 from mi_sparse_prt.scene.materials import bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.term_paths import TermPaths
@@ -139,7 +139,7 @@ def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )
-        error = factor_error(factors, material.bsdf, mesh.name)
+        error = measure_factor_error(factors, material.bsdf, mesh.name)
         found.append(
             {
                 "mesh": mesh.name,

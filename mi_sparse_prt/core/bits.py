@@ -26,12 +26,12 @@ def above_horizon(normals: NDArray[np.float32], directions: NDArray[np.float32])
     padded = np.zeros((3, words * BITS), np.float32)  # a direction of zeros is above no horizon
     padded[:, : len(directions)] = np.asarray(directions).T
     bits = np.empty((len(normals), words), np.uint32)
-    _above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
+    _mark_above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
     return bits
 
 
 @numba.njit(parallel=True, cache=True)
-def _above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
+def _mark_above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
     """Of directions (3, words, 32); without branches, so that a word takes a few vector instructions."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in numba.prange(len(normals)):

@@ -126,9 +126,9 @@ class CubemapLighting:
             return _project_image(environment, self)
         if isinstance(environment, mi.Emitter):
             return _project_emitter(environment, self)
-        return self._checked_texels(environment)
+        return self._check_texels(environment)
 
-    def _checked_texels(self, values: object) -> NDArray[np.float32]:
+    def _check_texels(self, values: object) -> NDArray[np.float32]:
         try:
             texels = np.array(values, dtype=np.float32)
         except (TypeError, ValueError) as error:

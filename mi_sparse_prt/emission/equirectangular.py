@@ -97,7 +97,7 @@ class _Arcs:
         self.length = np.arctan2(sine, _dot(start, end))
         self.start_y, self.end_y = start[:, 1], end[:, 1]
         self.phi0 = _azimuth(start)
-        self.phi1 = self.phi0 + _wrapped(_azimuth(end) - self.phi0)
+        self.phi1 = self.phi0 + _wrap(_azimuth(end) - self.phi0)
 
     def point(self, arc: Ints, a: Floats) -> Floats:
         return self.top[arc] * np.cos(a)[:, None] + self.side[arc] * np.sin(a)[:, None]
@@ -143,7 +143,7 @@ class _Arcs:
         # cos(a) = y / top_y has two solutions, one on either side of the top
         a = np.arccos(np.clip(np.cos(np.pi * row / height) / self.top_y[arc], -1, 1))
         arc, a = np.tile(arc, 2), np.concatenate([a, -a])
-        phi = self.phi0[arc] + _wrapped(_azimuth(self.point(arc, a)) - self.phi0[arc])
+        phi = self.phi0[arc] + _wrap(_azimuth(self.point(arc, a)) - self.phi0[arc])
         return arc, a, phi
 
 
@@ -163,7 +163,7 @@ def _polar_angle(p: Floats) -> Floats:
     return np.arctan2(np.hypot(p[:, 0], p[:, 2]), p[:, 1])
 
 
-def _wrapped(angle: Floats) -> Floats:
+def _wrap(angle: Floats) -> Floats:
     """The same angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 

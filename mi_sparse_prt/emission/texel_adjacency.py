@@ -94,7 +94,7 @@ class TexelSides:
         self._right, self._below = (pack(np.isin(np.arange(padded), pair - k * padded)) for k in range(2))
         self._outer = slice(2 * padded, None)
 
-    def crossed(self, seen: Bits, known: Bits) -> Bits:
+    def find_crossed(self, seen: Bits, known: Bits) -> Bits:
         """Pairs of which one texel is seen and the other is not.
 
         Parameters
@@ -108,7 +108,7 @@ class TexelSides:
         """
         result = np.zeros((len(seen), -(-len(self.paths) // BITS)), np.uint32)
         first, second = self.tables.first[self._outer], self.tables.second[self._outer]
-        _differing(seen, known, self._right, self._below, self._resolution, first, second, result)
+        _mark_differing(seen, known, self._right, self._below, self._resolution, first, second, result)
         return result
 
 
@@ -166,7 +166,7 @@ def _quadrants(beside: Ints, across: Ints, ways: Ints) -> Ints:
 
 
 @numba.njit(parallel=True, cache=True)
-def _differing(
+def _mark_differing(
     seen: Bits,
     known: Bits,
     right: Bits,
@@ -184,10 +184,10 @@ def _differing(
     words = seen.shape[1]
     for i in numba.prange(len(seen)):
         for w in range(words):
-            both = known[i, w] & right[w] & _ahead(known[i], w, 1)
-            result[i, w] = both & (seen[i, w] ^ _ahead(seen[i], w, 1))
-            both = known[i, w] & below[w] & _ahead(known[i], w, resolution)
-            result[i, words + w] = both & (seen[i, w] ^ _ahead(seen[i], w, resolution))
+            both = known[i, w] & right[w] & _word_ahead(known[i], w, 1)
+            result[i, w] = both & (seen[i, w] ^ _word_ahead(seen[i], w, 1))
+            both = known[i, w] & below[w] & _word_ahead(known[i], w, resolution)
+            result[i, words + w] = both & (seen[i, w] ^ _word_ahead(seen[i], w, resolution))
         for p in range(len(first)):
             a, b = first[p], second[p]
             differ = (bit_of(seen[i], a) ^ bit_of(seen[i], b)) & bit_of(known[i], a) & bit_of(known[i], b)
@@ -195,7 +195,7 @@ def _differing(
 
 
 @numba.njit
-def _ahead(bits: Bits, word: int, step: int) -> np.uint32:
+def _word_ahead(bits: Bits, word: int, step: int) -> np.uint32:
     """The word of bits that begins ``step`` bits after a word."""
     word, shift = word + step // BITS, np.uint32(step % BITS)
     low = bits[word] if word < len(bits) else np.uint32(0)

@@ -137,8 +137,8 @@ class CubemapEmitter(mi.Emitter):
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
         n = self.resolution
         u = dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
-        row, v = _sampled(self._rows, mi.UInt32(0), 6 * n, u.y, active)
-        col, w = _sampled(self._columns, row * (n + 1), n, u.x, active)
+        row, v = _invert_cumulative(self._rows, mi.UInt32(0), 6 * n, u.y, active)
+        col, w = _invert_cumulative(self._columns, row * (n + 1), n, u.x, active)
         face = row // n
         s = (mi.Float(col) + w) * (2 / n) - 1
         t = (mi.Float(row - face * n) + v) * (2 / n) - 1
@@ -226,7 +226,7 @@ def _cumulative(power: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.pad(sums / sums[:, -1:], ((0, 0), (1, 0))).astype(np.float32)
 
 
-def _sampled(
+def _invert_cumulative(
     cumulative: mi.Float, first: mi.UInt32, size: int, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.UInt32, mi.Float]:
     """Invert the running sums at `first`, ..., `first + size`: the entry u falls into, and where in it (0 to 1)."""

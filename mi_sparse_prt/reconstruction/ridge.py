@@ -105,14 +105,14 @@ def choose_deviation(
     error = sum(float((half.square - half.count * noise).sum()) for half in halves)
     best, most = 0.0, options.minimum_gain * max(error, 0.0)
     for deviation in options.deviations:
-        saved = _saved(*halves, noise, deviation) + _saved(*halves[::-1], noise, deviation)
+        saved = _saving(*halves, noise, deviation) + _saving(*halves[::-1], noise, deviation)
         error_of_sum = np.linalg.norm(saved)  # its standard error, were its mean 0
         if saved.sum() > max(most, options.confidence * error_of_sum):
             best, most = deviation, float(saved.sum())
     return best
 
 
-def _saved(one: System, other: System, noise: Floats, deviation: float) -> Floats:
+def _saving(one: System, other: System, noise: Floats, deviation: float) -> Floats:
     """By how much the correction from one half lowers the square of the other, (n,)."""
     a = fit_correction(one, noise, deviation)
     product = np.einsum("nij,nj->ni", other.gram, a)

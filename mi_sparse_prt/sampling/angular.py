@@ -95,7 +95,7 @@ class AngularGrid:
         steps = range(-self._radius, self._radius + 1)
         for dy in steps:
             for dx in steps:
-                texels, inside = self._shifted(dx, dy)
+                texels, inside = self._shift(dx, dy)
                 columns.append(np.where(self._sampled[texels] & inside, texels, -1))
         table = np.sort(np.stack(columns, axis=1), axis=1)[:, ::-1]  # [texel, place], -1 last
         table[:, 1:][table[:, 1:] == table[:, :-1]] = -1  # beyond an edge two places can meet one texel
@@ -131,7 +131,7 @@ class AngularGrid:
         rows, columns, weights = [], [], []
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                texels, inside = self._shifted(dx, dy)
+                texels, inside = self._shift(dx, dy)
                 # a sampled texel keeps its own value
                 wanted = ~self._sampled if dx or dy else np.ones_like(self._sampled)
                 good = np.flatnonzero(self._sampled[texels] & inside & wanted)
@@ -143,7 +143,7 @@ class AngularGrid:
         total = matrix.sum(axis=1)
         return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / total) @ matrix, dtype=np.float32)
 
-    def _shifted(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _shift(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """The texel (dx, dy) beside each texel, and whether it is not beyond two edges at once."""
         n = self.lighting.resolution
         column, row = self._column + dx, self._row + dy

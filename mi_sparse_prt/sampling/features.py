@@ -39,12 +39,12 @@ def find_contested(
         Above the vertex's own horizon, and not sampled before.
     """
     differ = np.empty((len(vertices), above.shape[1]), np.uint32)
-    _contested(neighbours, visible, known, vertices, above, evaluated, differ)
+    _find_contested(neighbours, visible, known, vertices, above, evaluated, differ)
     return differ
 
 
 @numba.njit(parallel=True, cache=True)
-def _contested(
+def _find_contested(
     neighbours: NDArray[np.int32],
     visible: Bits,
     known: Bits,

@@ -138,11 +138,12 @@ class Material:
         if not self._classes <= SHOWN:
             return False
         if "MeshAttribute" in self._classes and not all(
-            _even(values) for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
+            _has_equal_channels(values)
+            for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
         ):
             return False
         parameters = mi.traverse(self.bsdf)
-        return all(_even(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
+        return all(_has_equal_channels(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
         """SHA-256 of the BSDF's text and of all parameters that `mi.traverse` shows, bitmaps included."""
@@ -155,7 +156,7 @@ class Material:
         return state.digest()
 
 
-def _even(value: Any) -> bool:
+def _has_equal_channels(value: Any) -> bool:
     """Whether colours, a `mi.Color3f` or [..., channel], have equal channels; other things always do."""
     values = np.array(value, np.float64)
     if isinstance(value, mi.Color3f):

@@ -72,7 +72,7 @@ def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalV
     for a in range(0, len(bits), BLOCK):
         block = bits[a : a + BLOCK]
         above = above_horizon(normals[a : a + BLOCK], direct.lighting.directions)
-        crossed = sides.crossed(block, above)
+        crossed = sides.find_crossed(block, above)
         rows, pairs = list_bits(crossed)
         first = sides.tables.first[pairs]
         first_seen = (block[rows, first // BITS] >> (first % BITS).astype(np.uint32)) & np.uint32(1)
@@ -112,7 +112,7 @@ def _cut_texels(
     sides: TexelSides, bits: Bits, above: Bits, crossings: Crossings
 ) -> tuple[Bits, NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
     """Bits, and for each vertex how many texels are seen in part, which, and their shares."""
-    horizon = sides.crossed(above, np.full_like(above, 0xFFFFFFFF))
+    horizon = sides.find_crossed(above, np.full_like(above, 0xFFFFFFFF))
     m = len(sides.tables.beside)
     room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + count_bits(horizon), m))
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)

@@ -56,7 +56,7 @@ def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: GlossyT
         v = direct.glossy[i]
         local = lighting.directions @ turn[v].T
         seen = rows[v] > 0  # above the horizon and not blocked
-        f = glossy.factors[0].grid.interpolated(glossy.factors[0].incident, local)
+        f = glossy.factors[0].grid.interpolate(glossy.factors[0].incident, local)
         expected = f * seen * lighting.solid_angles
         found = rows[scene.n_vertices + 3 * i : scene.n_vertices + 3 * (i + 1)]
         high = local[:, 2] > 0.1
@@ -100,7 +100,7 @@ def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: GlossyTransport) -
     radiance = glossy.relight(light, up)
     v = glossy.glossy[np.argmax(scene.normals[glossy.glossy, 1])]  # the top of the ball
     local = (frames(glossy.tangents, glossy.normals)[v] @ up).astype(np.float32)
-    g = glossy.factors[0].grid.interpolated(glossy.factors[0].outgoing, local[None])[:, 0, 0]
+    g = glossy.factors[0].grid.interpolate(glossy.factors[0].outgoing, local[None])[:, 0, 0]
     expected = glossy.albedo[v] * found.white[v] + g @ found.terms[v]
     np.testing.assert_allclose(radiance[v], expected, rtol=1e-4)
     assert not radiance[scene.normals[:, 1] < -0.01].any()

@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, evaluate_brdf, factor_error, harmonic_factors
+from mi_sparse_prt.reflection.brdf_factors import (
+    DirectionGrid,
+    evaluate_brdf,
+    harmonic_factors,
+    measure_factor_error,
+)
 
 GRID = DirectionGrid(12, 24)
 BRUSHED = {"type": "ashikhmin_shirley", "exponent_u": 5.0, "exponent_v": 60.0}
@@ -68,7 +73,7 @@ def test_light_that_is_smooth_is_right():
     seen = (grid.solid_angles * w[:, 2])[:, None]
     picture, missing = (np.tensordot(grid.solid_angles, x, 1) for x in (true, values - true))
     assert np.sqrt((seen * missing**2).sum()) < 0.02 * np.sqrt((seen * picture**2).sum())
-    error = factor_error(found, bsdf, "vase")
+    error = measure_factor_error(found, bsdf, "vase")
     assert len(error.whole) == 9 and error.whole[8] < 0.6 * error.whole[0]
 
 

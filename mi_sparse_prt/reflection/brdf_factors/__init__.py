@@ -10,8 +10,8 @@ from mi_sparse_prt.reflection.brdf_factors.diffuse_part import (
     is_anisotropic,
 )
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
-from mi_sparse_prt.reflection.brdf_factors.factor_cache import factors_of
-from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, factor_error
+from mi_sparse_prt.reflection.brdf_factors.factor_cache import FactorOptions, factors_of
+from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, measure_factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.reflection.brdf_factors.harmonics import harmonic_factors
 
@@ -20,11 +20,12 @@ __all__ = [
     "BrdfFactors",
     "DirectionGrid",
     "FactorError",
+    "FactorOptions",
     "is_anisotropic",
     "diffuse_reflectance",
     "evaluate_brdf",
     "factor_brdf",
-    "factor_error",
+    "measure_factor_error",
     "factors_of",
     "harmonic_factors",
 ]
