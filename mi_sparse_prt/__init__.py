@@ -24,7 +24,8 @@ from mi_sparse_prt.emission.environment import Environment, load_environment  # 
 from mi_sparse_prt.plugins import register as _register_plugins  # noqa: E402
 from mi_sparse_prt.precompute import precompute, precompute_glossy  # noqa: E402
 from mi_sparse_prt.relighting.image import render  # noqa: E402
-from mi_sparse_prt.scene.scene import Scene, load_scene  # noqa: E402
+from mi_sparse_prt.scene.loading import load_scene  # noqa: E402
+from mi_sparse_prt.scene.scene import Scene  # noqa: E402
 from mi_sparse_prt.storage import load_transport  # noqa: E402
 from mi_sparse_prt.transport import LightTransport  # noqa: E402
 from mi_sparse_prt.validation.validate import Validation, validate  # noqa: E402

@@ -31,8 +31,8 @@ from mi_sparse_prt.reconstruction.interpolation_weights import inverse_distance_
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.features import best_features
-from mi_sparse_prt.sampling.spatial import choose_dense, weighted_choice
+from mi_sparse_prt.sampling.features import choose_features
+from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense, choose_weighted
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -177,11 +177,10 @@ def compare_choices(
         raise PrtError(f"n_vertices is {n_vertices}: give 1 or more")
     surface = _surface(scene, lighting, mesh)
     n, count = len(surface.positions), max(1, round(SHARE * lighting.n_directions))
-    by_rank = choose_dense(
-        surface.positions, surface.keys, lambda ids: surface.bits[ids], ROWS, radius=RADIUS, seed=seed
-    ).ids
-    at_random = weighted_choice(np.ones(n), surface.keys, len(by_rank), seed + 1)
-    sample = weighted_choice(np.ones(n), surface.keys, n_vertices, seed + 2)
+    sampling = SpatialSampling(ROWS, radius=RADIUS)
+    by_rank = choose_dense(surface.positions, surface.keys, lambda ids: surface.bits[ids], sampling, seed).ids
+    at_random = choose_weighted(np.ones(n), surface.keys, len(by_rank), seed + 1)
+    sample = choose_weighted(np.ones(n), surface.keys, n_vertices, seed + 2)
     norms = (surface.rows(sample).astype(np.float64) ** 2).sum(axis=1)
     if not norms.any():
         raise PrtError(f"the mesh {mesh!r} sees no light at {len(sample)} vertices: choose another mesh")
@@ -266,9 +265,9 @@ def _from_rank(
 
 def _by_vertex(local: _Local, count: int, n_sparse: int) -> _Result:
     """Columns chosen for each sparse vertex; of such the whole mesh has `n_sparse`."""
-    best_features(local.near[:1], local.rows, local.features, count)  # compiles
+    choose_features(local.near[:1], local.rows, local.features, count)  # compiles
     start = time.perf_counter()
-    directions = best_features(local.near, local.rows, local.features, count)
+    directions = choose_features(local.near, local.rows, local.features, count)
     seconds = (time.perf_counter() - start) * n_sparse / len(local.sparse)
     return _fitted(local, directions, seconds)
 

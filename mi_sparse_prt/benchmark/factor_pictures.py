@@ -25,7 +25,7 @@ def factor_picture(factors: BrdfFactors) -> Figure:
     panels = figure.subplots(2, factors.terms, squeeze=False)
     for side, (line, tables) in enumerate(zip(panels, rows, strict=True)):
         for k, axes in enumerate(line):
-            values = factors.grid.interpolated(tables[k], every).reshape(SIZE, SIZE)
+            values = factors.grid.interpolate(tables[k], every).reshape(SIZE, SIZE)
             largest = max(float(np.abs(values[inside]).max()), 1e-12)
             shown = np.where(inside, values, np.nan)
             axes.imshow(shown, cmap="RdBu_r", vmin=-largest, vmax=largest)

@@ -16,9 +16,9 @@ from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.precompute import precompute
-from mi_sparse_prt.reflection.brdf_factors import factor_error
+from mi_sparse_prt.reflection.brdf_factors import measure_factor_error
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.scene.materials import kind
+from mi_sparse_prt.scene.materials import bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
@@ -143,11 +143,11 @@ def _factor_errors(scene: Scene, transport: LightTransport) -> list[Report]:
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )
-        error = factor_error(factors, material.bsdf, mesh.name)
+        error = measure_factor_error(factors, material.bsdf, mesh.name)
         found.append(
             {
                 "mesh": mesh.name,
-                "bsdf": kind(material.bsdf),
+                "bsdf": bsdf_class(material.bsdf),
                 "terms": factors.terms,
                 "whole": error.whole.tolist(),
                 "grazing": error.grazing.tolist(),

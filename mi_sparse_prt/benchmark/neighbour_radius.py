@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.exact_rows import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.benchmark.least_squares import least_squares_fit
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.profiling import Stopwatch
@@ -19,11 +20,11 @@ from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS
-from mi_sparse_prt.reconstruction.l1 import l1_fit, least_squares_fit
+from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.features import best_features
-from mi_sparse_prt.sampling.spatial import weighted_choice
+from mi_sparse_prt.sampling.features import choose_features
+from mi_sparse_prt.sampling.spatial import choose_weighted
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -186,7 +187,7 @@ def _sampled(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: in
     others = np.setdiff1d(np.arange(mesh.vertices.start, mesh.vertices.stop), dense.ids)
     if not len(others):
         raise PrtError(f"all vertices of the mesh {mesh.name!r} are dense: it is too small for this")
-    sparse = others[weighted_choice(np.ones(len(others)), points.keys[others], n_vertices, seed)]
+    sparse = others[choose_weighted(np.ones(len(others)), points.keys[others], n_vertices, seed)]
     exact = white_rows(traced_rows(direct, sparse), scene.normals[sparse], lighting)
     rows = white_rows(dense.rows.visible, scene.normals[dense.ids], lighting)
     precise = rows.astype(np.float64)
@@ -210,7 +211,7 @@ def _at_radius(
     squared, used, directions = np.zeros(len(CURVES)), np.zeros(len(CURVES)), 0
     for ids in _blocks(known):
         some = near[ids, : max(1, known[ids].max())]
-        chosen = best_features(some, samples.dense, samples.features, count)
+        chosen = choose_features(some, samples.dense, samples.features, count)
         directions += int((chosen >= 0).sum())
         weights = _fits(samples, ids, some, chosen, relative_lambda)
         used += (weights != 0).sum(axis=(0, 2))

@@ -18,7 +18,7 @@ import mitsuba as mi
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.precompute import precompute
-from mi_sparse_prt.scene.scene import load_scene
+from mi_sparse_prt.scene.loading import load_scene
 
 PARTS = {"direct": 2, "whole": 5}  # max_depth
 

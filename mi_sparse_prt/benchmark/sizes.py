@@ -17,7 +17,8 @@ from mi_sparse_prt.benchmark.machine import report_header
 from mi_sparse_prt.benchmark.one_size import PARTS, measured_apart
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.scene.scene import Scene, load_scene
+from mi_sparse_prt.scene.loading import load_scene
+from mi_sparse_prt.scene.scene import Scene
 
 COUNTS = (10_000, 32_000, 64_000, 128_000, 256_000, 500_000)  # vertices
 RESOLUTIONS = (8, 16, 32, 64)

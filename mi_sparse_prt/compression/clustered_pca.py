@@ -27,7 +27,7 @@ from mi_sparse_prt.compression.cpca import (
     two_pass_cpca,
 )
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.core.threads import overlapped
+from mi_sparse_prt.core.threads import run_overlapped
 from mi_sparse_prt.measurement.measurement import MeshRange
 from mi_sparse_prt.transport import LightTransport
 
@@ -199,7 +199,7 @@ def finished(rows: SphereRows, found: Clusters, coordinates: Floats, centred: bo
     centred : bool
     """
     spaces, sums = _Spaces(rows, found, coordinates, centred), np.zeros(found.bases.shape[1] + 4)
-    for more in overlapped(partial(spaces.fill, *block) for block in _blocks(rows, found)):
+    for more in run_overlapped(partial(spaces.fill, *block) for block in _blocks(rows, found)):
         sums += more
     left, rest = np.maximum(sums[:-3], 0), sums[-3:]
     return MeshClusters(found.labels, spaces.coefficients, spaces.means, spaces.bases, left, *rest.tolist())

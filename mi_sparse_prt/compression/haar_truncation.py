@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.compression.clustered_pca import mesh_rows
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar
 from mi_sparse_prt.measurement.measurement import MeshRange
@@ -184,7 +185,7 @@ def _stored(coefficients: Floats, lighting: CubemapLighting) -> HaarRows:
     flat = coefficients.reshape(-1, m)
     largest = np.maximum(flat.max(axis=1), -flat.min(axis=1))
     lengths = np.where(largest > BLACK, np.count_nonzero(flat, axis=1), 0)
-    starts = np.concatenate([[0], np.cumsum(lengths)])
+    starts = row_starts(lengths)
     places = np.empty(starts[-1], np.uint16 if m <= np.iinfo(np.uint16).max + 1 else np.uint32)
     values = np.empty(starts[-1], np.float32)
     _list(flat, largest, starts, places, values)
@@ -225,7 +226,7 @@ def _joined(parts: list[HaarRows]) -> HaarRows:
     """Rows of one part after those of another."""
     lengths = np.concatenate([np.diff(part.starts) for part in parts])
     return HaarRows(
-        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        row_starts(lengths),
         np.concatenate([part.places for part in parts]),
         np.concatenate([part.values for part in parts]),
         np.concatenate([part.scales for part in parts]),

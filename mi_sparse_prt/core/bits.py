@@ -1,7 +1,7 @@
 """Rows of yes-or-no answers, one bit per direction: bit j % 32 of word j // 32, as ``DirectSolver`` packs them.
 
 What compiled functions fill is made by NumPy: it asks the system for huge pages, and numba does not. Half the time of
-``listed`` went into page faults.
+``list_bits`` went into page faults.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from llvmlite import ir
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
+
 Bits = NDArray[np.uint32]
 BITS = 32  # of a word
 
@@ -24,12 +26,12 @@ def above_horizon(normals: NDArray[np.float32], directions: NDArray[np.float32])
     padded = np.zeros((3, words * BITS), np.float32)  # a direction of zeros is above no horizon
     padded[:, : len(directions)] = np.asarray(directions).T
     bits = np.empty((len(normals), words), np.uint32)
-    _above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
+    _mark_above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
     return bits
 
 
 @numba.njit(parallel=True, cache=True)
-def _above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
+def _mark_above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
     """Of directions (3, words, 32); without branches, so that a word takes a few vector instructions."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in numba.prange(len(normals)):
@@ -61,13 +63,13 @@ def unpack(bits: Bits, n: int) -> NDArray[np.bool_]:
 
 
 @intrinsic
-def ones(typingctx: Any, word: Any) -> Any:
+def count_ones(typingctx: Any, word: Any) -> Any:
     """Bits set in a word: LLVM's own instruction, which vectorises."""
     return word(word), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
 
 
 @intrinsic
-def lowest(typingctx: Any, word: Any) -> Any:
+def lowest_bit(typingctx: Any, word: Any) -> Any:
     """Place of the lowest bit set in a word that is not 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -83,18 +85,18 @@ def bit_of(words: Bits, direction: int) -> np.uint32:
 
 
 @numba.njit(parallel=True, cache=True)
-def counts(bits: Bits) -> NDArray[np.int64]:
+def count_bits(bits: Bits) -> NDArray[np.int64]:
     """Number of set bits in each row, (n,)."""
     result = np.empty(len(bits), np.int64)
     for i in numba.prange(len(bits)):
         total = np.uint32(0)
         for w in range(bits.shape[1]):
-            total += ones(bits[i, w])  # type: ignore[call-arg]  # numba gives the context
+            total += count_ones(bits[i, w])  # type: ignore[call-arg]  # numba gives the context
         result[i] = total
     return result
 
 
-def listed(bits: Bits) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+def list_bits(bits: Bits) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """Row and direction of every set bit, row after row: two (m,) arrays."""
     starts = _starts(bits)
     rows, directions = np.empty(starts[-1], np.uint32), np.empty(starts[-1], np.uint32)
@@ -102,8 +104,8 @@ def listed(bits: Bits) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     return rows, directions
 
 
-def scattered(mask: Bits, values: NDArray[np.bool_]) -> Bits:
-    """The inverse of ``listed``: those bits of ``mask`` whose listed value is true, (n, words)."""
+def scatter_bits(mask: Bits, values: NDArray[np.bool_]) -> Bits:
+    """The inverse of ``list_bits``: those bits of ``mask`` whose listed value is true, (n, words)."""
     result = np.empty_like(mask)
     _scatter(mask, _starts(mask), values, result)
     return result
@@ -111,7 +113,7 @@ def scattered(mask: Bits, values: NDArray[np.bool_]) -> Bits:
 
 def _starts(bits: Bits) -> NDArray[np.int64]:
     """Where the set bits of each row start in a list of all, and its length, (n + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts(bits))])
+    return row_starts(count_bits(bits))
 
 
 @numba.njit(parallel=True, cache=True)
@@ -124,7 +126,7 @@ def _fill(
         for w in range(bits.shape[1]):
             left = bits[i, w]
             while left:
-                directions[at] = np.uint32(w * BITS) + lowest(left)  # type: ignore[call-arg]
+                directions[at] = np.uint32(w * BITS) + lowest_bit(left)  # type: ignore[call-arg]
                 at += 1
                 left &= left - np.uint32(1)
 
@@ -136,13 +138,13 @@ def _scatter(mask: Bits, starts: NDArray[np.int64], values: NDArray[np.bool_], r
         for w in range(mask.shape[1]):
             left, word = mask[i, w], np.uint32(0)
             while left:
-                word |= np.uint32(values[at]) << lowest(left)  # type: ignore[call-arg]
+                word |= np.uint32(values[at]) << lowest_bit(left)  # type: ignore[call-arg]
                 at += 1
                 left &= left - np.uint32(1)
             result[i, w] = word
 
 
-def overwrite(
+def overwrite_bits(
     bits: Bits, known: Bits, rows: NDArray[np.int64], mask: Bits, values: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """Put listed values into some rows, in place.
@@ -155,7 +157,7 @@ def overwrite(
     mask : (n, words) uint32 bits
         Which bits of these rows.
     values : (k,) bool
-        In the order of ``listed(mask)``.
+        In the order of ``list_bits(mask)``.
 
     Returns
     -------
@@ -182,11 +184,11 @@ def _overwrite(
             if not left:
                 continue
             while left:
-                word |= np.uint32(values[at]) << lowest(left)  # type: ignore[call-arg]
+                word |= np.uint32(values[at]) << lowest_bit(left)  # type: ignore[call-arg]
                 at += 1
                 left &= left - np.uint32(1)
             before = bits[row, w] & mask[i, w]
-            changed[i] += ones(before ^ word)  # type: ignore[call-arg]
+            changed[i] += count_ones(before ^ word)  # type: ignore[call-arg]
             bits[row, w] ^= before ^ word
             known[row, w] |= mask[i, w]
     return changed

@@ -1,11 +1,10 @@
-"""Vertices in the order of a curve through space: those that follow each other are near each other (Morton 1966)."""
+"""Points in the order of a space-filling curve: those that follow each other are near each other (Morton 1966)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-BITS = 21  # of a coordinate
 # how the bits of a number are moved apart, two empty places between them
 _SPREAD = (
     (32, 0x1F00000000FFFF),
@@ -16,19 +15,20 @@ _SPREAD = (
 )
 
 
-def along_curve(positions: NDArray[np.floating], keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+def morton_order(positions: NDArray[np.floating], keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     """Order (n,) of positions along Morton's curve through their box.
 
     Parameters
     ----------
     positions : (n, 3) float, any frame
     keys : (n,) uint64
-        Names, which decide where positions are equal: the same order in whatever order positions come.
+        They decide where positions are equal: the same order in whatever order positions come.
     """
     p = np.asarray(positions, np.float64)
     if not len(p):
         return np.zeros(0, np.int64)
-    cells = (p - p.min(axis=0)) / max(float(np.ptp(p, axis=0).max()), 1e-30) * ((1 << BITS) - 1)
+    largest = (1 << 21) - 1  # 21 bits of a coordinate
+    cells = (p - p.min(axis=0)) / max(float(np.ptp(p, axis=0).max()), 1e-30) * largest
     place = np.zeros(len(p), np.uint64)
     for axis, x in enumerate(cells.astype(np.uint64).T):
         for shift, mask in _SPREAD:

@@ -1,18 +1,39 @@
-"""Names for vertices and triangles that do not depend on the order they come in: 64-bit hashes of what they are."""
+"""Random numbers keyed by what they are for, not by when they are drawn: SplitMix64 (Steele, Lea and Flood 2014).
+
+Vertices and triangles have 64-bit keys, hashes of what they are, and the random numbers of an element of the matrix
+follow from its vertex's key, its texel and a seed. Neither the order nor the blocks in which elements are evaluated
+matter. One text of the generator's finaliser serves NumPy, numba and Dr.Jit.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+GOLDEN_RATIO = 0x9E3779B97F4A7C15  # 2^64 / golden ratio, odd: the step from state to state
+
+
+def finalise(x: Any) -> Any:
+    """SplitMix64's finaliser: a bijection of 64-bit words, NumPy's or Dr.Jit's, all bits scattered."""
+    x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9
+    x = (x ^ (x >> 27)) * 0x94D049BB133111EB
+    return x ^ (x >> 31)
+
+
+#: `finalise` for functions that numba compiles, of a ``numpy.uint64``.
+finalise_compiled = numba.njit(finalise)
+
 
 def mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """SplitMix64's finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words, all bits scattered."""
+    """SplitMix64's number for each state: a bijection of 64-bit words, all bits scattered."""
     with np.errstate(over="ignore"):
-        x = x + np.uint64(0x9E3779B97F4A7C15)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return x ^ (x >> np.uint64(31))
+        mixed: NDArray[np.uint64] = finalise(x + np.uint64(GOLDEN_RATIO))
+    return mixed
 
 
 def hash_rows(values: NDArray[np.float32], seed: NDArray[np.uint64] | int = 0) -> NDArray[np.uint64]:
@@ -22,3 +43,10 @@ def hash_rows(values: NDArray[np.float32], seed: NDArray[np.uint64] | int = 0) -
     for column in bits.T:
         state = mix(state ^ column)
     return state
+
+
+def random_generator(key: mi.UInt64, texel: mi.UInt32, sample: mi.UInt32, seed: int) -> mi.PCG32:
+    """Independent random numbers on the device for one sample of one element, whatever its lane or block."""
+    salt = dr.opaque(mi.UInt64, seed * GOLDEN_RATIO % (1 << 64))
+    state = finalise(finalise(key + salt) + ((mi.UInt64(texel) << 32) | mi.UInt64(sample)))
+    return mi.PCG32(initstate=state, initseq=mi.UInt64(texel))

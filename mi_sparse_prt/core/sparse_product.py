@@ -7,18 +7,15 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-FEW = 8  # columns that are not worth a second thread
-SLAB = 512  # columns at a time: more of the dense matrix stays in the cache
-
 Floats = NDArray[np.float32]
 
 
-def product(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
+def multiply_sparse(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
     """A sparse matrix (n, m) times a dense one (m, k), float32; the same for any number of threads."""
-    return gathered(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
+    return multiply_scaled(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
 
 
-def gathered(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
+def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, slab: int = 512) -> Floats:
     """G rho x for several albedos rho and one light x, of which each row is read once for all of them.
 
     Parameters
@@ -29,27 +26,29 @@ def gathered(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> F
         The diagonals of rho.
     light : (m, k) float32
         x.
+    slab : int
+        Columns of x at a time: more of it stays in the cache.
 
     Returns
     -------
     (channels, n, k) float32
         The same for any number of threads.
     """
-    if light.shape[1] < FEW:
+    if light.shape[1] < 8:  # columns that are not worth a second thread
         return np.stack([matrix @ (rho[:, None] * light) for rho in albedo])
     shares = np.linspace(0, matrix.nnz, numba.get_num_threads() + 1)
     bounds = np.searchsorted(matrix.indptr, shares)  # equal numbers of entries, not of rows
     bounds[0], bounds[-1] = 0, matrix.shape[0]
     result = np.empty((len(albedo), matrix.shape[0], light.shape[1]), np.float32)
-    for a in range(0, light.shape[1], SLAB):
-        part = slice(a, a + SLAB)
-        slab = np.ascontiguousarray(light[:, part], np.float32)
-        _gathered(bounds, matrix.indptr, matrix.indices, matrix.data, albedo, slab, result[:, :, part])
+    for a in range(0, light.shape[1], slab):
+        part = slice(a, a + slab)
+        some = np.ascontiguousarray(light[:, part], np.float32)
+        _multiply(bounds, matrix.indptr, matrix.indices, matrix.data, albedo, some, result[:, :, part])
     return result
 
 
 @numba.njit(parallel=True, fastmath={"contract"}, cache=True)
-def _gathered(
+def _multiply(
     bounds: NDArray[np.int64],
     starts: NDArray[np.int32],
     columns: NDArray[np.int32],

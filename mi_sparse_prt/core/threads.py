@@ -13,8 +13,6 @@ from typing import TypeVar
 import numba
 from threadpoolctl import ThreadpoolController
 
-WORKERS = 2  # beside the thread that prepares their tasks
-
 Result = TypeVar("Result")
 
 
@@ -52,12 +50,13 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(threads)
 
 
-def overlapped(tasks: Iterable[Callable[[], Result]]) -> Iterator[Result]:
+def run_overlapped(tasks: Iterable[Callable[[], Result]]) -> Iterator[Result]:
     """Results of tasks, in their order; some are worked on while the next ones are prepared."""
-    with one_thread(), ThreadPoolExecutor(WORKERS) as pool:
+    workers = 2  # beside the thread that prepares their tasks
+    with one_thread(), ThreadPoolExecutor(workers) as pool:
         pending: deque[Future[Result]] = deque()
         for task in tasks:
-            while len(pending) > WORKERS:
+            while len(pending) > workers:
                 yield pending.popleft().result()
             pending.append(pool.submit(task))
         for future in pending:

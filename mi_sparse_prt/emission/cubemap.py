@@ -34,7 +34,6 @@ FACE_FRAMES = np.array(
     ],
     dtype=np.float64,
 )
-SAMPLES_PER_BLOCK = 1 << 20  # directions at which an emitter is evaluated at once: about 100 MB
 
 
 class CubemapLighting:
@@ -127,9 +126,9 @@ class CubemapLighting:
             return _project_image(environment, self)
         if isinstance(environment, mi.Emitter):
             return _project_emitter(environment, self)
-        return self._checked_texels(environment)
+        return self._check_texels(environment)
 
-    def _checked_texels(self, values: object) -> NDArray[np.float32]:
+    def _check_texels(self, values: object) -> NDArray[np.float32]:
         try:
             texels = np.array(values, dtype=np.float32)
         except (TypeError, ValueError) as error:
@@ -220,7 +219,7 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
         )
     n = lighting.resolution
     s = _samples_per_edge(emitter, n)
-    block = max(1, SAMPLES_PER_BLOCK // s**2)
+    block = max(1, (1 << 20) // s**2)  # a million directions at once: about 100 MB
     radiance = np.empty((lighting.n_directions, 3))  # [texel, rgb]
     for start in range(0, lighting.n_directions, block):
         texels = np.arange(start, min(start + block, lighting.n_directions))

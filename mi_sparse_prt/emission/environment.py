@@ -66,7 +66,7 @@ class Environment:
         self.report: dict[str, Any] = {"source": source, "width": pixels.shape[1], "height": pixels.shape[0]}
         self.report |= _clamp_negative(pixels, source)
         self.pixels: NDArray[np.float32] = pixels
-        self.rotation: NDArray[np.float64] = np.eye(3) if rotation is None else _checked_rotation(rotation)
+        self.rotation: NDArray[np.float64] = np.eye(3) if rotation is None else _check_rotation(rotation)
 
     @property
     def solid_angles(self) -> NDArray[np.floating]:
@@ -87,7 +87,7 @@ class Environment:
         PrtError
             If a matrix is not 3 x 3, orthonormal and of determinant 1 within 1e-4.
         """
-        turn = _about_up(float(rotation)) if np.ndim(rotation) == 0 else _checked_rotation(rotation)  # type: ignore[arg-type]
+        turn = _rotation_about_up(float(rotation)) if np.ndim(rotation) == 0 else _check_rotation(rotation)  # type: ignore[arg-type]
         turned = copy.copy(self)
         turned.rotation = turn @ self.rotation
         return turned
@@ -191,7 +191,7 @@ def _clamp_negative(pixels: NDArray[np.float32], source: str) -> dict[str, Any]:
     }
 
 
-def _about_up(degrees: float) -> NDArray[np.float64]:
+def _rotation_about_up(degrees: float) -> NDArray[np.float64]:
     if not np.isfinite(degrees):
         raise PrtError(f"rotation by {degrees} degrees: give a finite angle")
     sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
@@ -200,7 +200,7 @@ def _about_up(degrees: float) -> NDArray[np.float64]:
     return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
 
-def _checked_rotation(matrix: ArrayLike) -> NDArray[np.float64]:
+def _check_rotation(matrix: ArrayLike) -> NDArray[np.float64]:
     matrix = np.array(matrix, dtype=np.float64)
     if matrix.shape != (3, 3):
         raise PrtError(f"rotation has shape {matrix.shape}; give degrees about y or a 3 x 3 matrix")

@@ -16,6 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import concatenate_ranges
+
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int_]
 
@@ -95,7 +97,7 @@ class _Arcs:
         self.length = np.arctan2(sine, _dot(start, end))
         self.start_y, self.end_y = start[:, 1], end[:, 1]
         self.phi0 = _azimuth(start)
-        self.phi1 = self.phi0 + _wrapped(_azimuth(end) - self.phi0)
+        self.phi1 = self.phi0 + _wrap(_azimuth(end) - self.phi0)
 
     def point(self, arc: Ints, a: Floats) -> Floats:
         return self.top[arc] * np.cos(a)[:, None] + self.side[arc] * np.sin(a)[:, None]
@@ -141,7 +143,7 @@ class _Arcs:
         # cos(a) = y / top_y has two solutions, one on either side of the top
         a = np.arccos(np.clip(np.cos(np.pi * row / height) / self.top_y[arc], -1, 1))
         arc, a = np.tile(arc, 2), np.concatenate([a, -a])
-        phi = self.phi0[arc] + _wrapped(_azimuth(self.point(arc, a)) - self.phi0[arc])
+        phi = self.phi0[arc] + _wrap(_azimuth(self.point(arc, a)) - self.phi0[arc])
         return arc, a, phi
 
 
@@ -161,7 +163,7 @@ def _polar_angle(p: Floats) -> Floats:
     return np.arctan2(np.hypot(p[:, 0], p[:, 2]), p[:, 1])
 
 
-def _wrapped(angle: Floats) -> Floats:
+def _wrap(angle: Floats) -> Floats:
     """The same angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -172,6 +174,4 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 def _ranges(first: Ints, stop: Ints) -> tuple[Ints, Ints]:
     """Concatenated ranges first[i], ..., stop[i] - 1: the index i of each member, and the member."""
-    counts = np.maximum(stop - first, 0)
-    owner = np.repeat(np.arange(len(first)), counts)
-    return owner, np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner] + first[owner]
+    return concatenate_ranges(first, np.maximum(stop - first, 0))

@@ -19,7 +19,6 @@ from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-_BEYOND = 1.01  # half texels: just beyond a side
 
 Ints = NDArray[np.int32]
 
@@ -95,7 +94,7 @@ class TexelSides:
         self._right, self._below = (pack(np.isin(np.arange(padded), pair - k * padded)) for k in range(2))
         self._outer = slice(2 * padded, None)
 
-    def crossed(self, seen: Bits, known: Bits) -> Bits:
+    def find_crossed(self, seen: Bits, known: Bits) -> Bits:
         """Pairs of which one texel is seen and the other is not.
 
         Parameters
@@ -109,7 +108,7 @@ class TexelSides:
         """
         result = np.zeros((len(seen), -(-len(self.paths) // BITS)), np.uint32)
         first, second = self.tables.first[self._outer], self.tables.second[self._outer]
-        _differing(seen, known, self._right, self._below, self._resolution, first, second, result)
+        _mark_differing(seen, known, self._right, self._below, self._resolution, first, second, result)
         return result
 
 
@@ -131,8 +130,9 @@ def _points(lighting: CubemapLighting, dx: float, dy: float) -> NDArray[np.float
 def _beyond(lighting: CubemapLighting, dx: int, dy: int) -> Ints:
     """The texel beyond a side or a corner of each, -1 beyond a corner of the cube."""
     _, s, t = _grid(lighting)
-    texels = lighting.texel_of(_points(lighting, _BEYOND * dx, _BEYOND * dy))
-    outside = [np.abs(x + _BEYOND * d / lighting.resolution) > 1 for x, d in ((s, dx), (t, dy))]
+    step = 1.01  # half texels: just beyond a side
+    texels = lighting.texel_of(_points(lighting, step * dx, step * dy))
+    outside = [np.abs(x + step * d / lighting.resolution) > 1 for x, d in ((s, dx), (t, dy))]
     return np.where(outside[0] & outside[1], -1, texels).astype(np.int32)
 
 
@@ -166,7 +166,7 @@ def _quadrants(beside: Ints, across: Ints, ways: Ints) -> Ints:
 
 
 @numba.njit(parallel=True, cache=True)
-def _differing(
+def _mark_differing(
     seen: Bits,
     known: Bits,
     right: Bits,
@@ -184,10 +184,10 @@ def _differing(
     words = seen.shape[1]
     for i in numba.prange(len(seen)):
         for w in range(words):
-            both = known[i, w] & right[w] & _ahead(known[i], w, 1)
-            result[i, w] = both & (seen[i, w] ^ _ahead(seen[i], w, 1))
-            both = known[i, w] & below[w] & _ahead(known[i], w, resolution)
-            result[i, words + w] = both & (seen[i, w] ^ _ahead(seen[i], w, resolution))
+            both = known[i, w] & right[w] & _word_ahead(known[i], w, 1)
+            result[i, w] = both & (seen[i, w] ^ _word_ahead(seen[i], w, 1))
+            both = known[i, w] & below[w] & _word_ahead(known[i], w, resolution)
+            result[i, words + w] = both & (seen[i, w] ^ _word_ahead(seen[i], w, resolution))
         for p in range(len(first)):
             a, b = first[p], second[p]
             differ = (bit_of(seen[i], a) ^ bit_of(seen[i], b)) & bit_of(known[i], a) & bit_of(known[i], b)
@@ -195,7 +195,7 @@ def _differing(
 
 
 @numba.njit
-def _ahead(bits: Bits, word: int, step: int) -> np.uint32:
+def _word_ahead(bits: Bits, word: int, step: int) -> np.uint32:
     """The word of bits that begins ``step`` bits after a word."""
     word, shift = word + step // BITS, np.uint32(step % BITS)
     low = bits[word] if word < len(bits) else np.uint32(0)

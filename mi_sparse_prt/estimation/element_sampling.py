@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.bits import Bits, bit_of
+from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.transport import LightTransport
 
@@ -174,8 +175,8 @@ def _kept(
     for i in numba.prange(len(normals)):
         state = seeds[i]
         for _ in range(trials):
-            state += np.uint64(0x9E3779B97F4A7C15)
-            random = _mixed(state)
+            state += np.uint64(GOLDEN_RATIO)
+            random = finalise_compiled(state)
             texel = int(((random >> np.uint64(32)) * np.uint64(len(directions))) >> np.uint64(32))
             uniform = (random & np.uint64(0xFFFFFFFF)) / 2.0**32
             probability = (
@@ -228,11 +229,3 @@ def _near_edge(
         if bit_of(bits, j) != own and _cosine(normal, directions[j]) > 0:
             return True
     return False
-
-
-@numba.njit
-def _mixed(x: np.uint64) -> np.uint64:
-    """The finaliser of SplitMix64, as in ``hashing``."""
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))

@@ -13,15 +13,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import hash_rows
 from mi_sparse_prt.scene.scene import Scene
 
-# A Mitsuba ray reaches a vertex from just above one of its triangles: this far from the corner towards the
-# triangle's centre (barycentric), and from this height over it (in units of the scene's longest side).
-# Later pairs are for vertices that the first ones miss (slivers, surfaces in contact).
-_APPROACHES = ((1e-2, 2e-4), (3e-2, 1e-4), (1e-1, 3e-5), (3e-2, 1e-3))
-
-# Vertices on a mesh's border move into their triangle by this many of Mitsuba's ray offsets, or by a quarter of the
-# way to its centre if that is less.
-_BORDER_OFFSETS = 4
-
 
 @dataclass(frozen=True)
 class Points:
@@ -68,11 +59,8 @@ def _vertex_points(scene: Scene) -> Points:
     border, centre = _centres_beside_border(positions, triangles)
     inwards = centre - positions[border]  # [border vertex, xyz]
     length = np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-30)
-    offset = (
-        _BORDER_OFFSETS
-        * float(mi.math.RayEpsilon)
-        * (1 + np.abs(positions[border]).max(axis=1, keepdims=True))
-    )
+    # into their triangle by four of Mitsuba's ray offsets, or by a quarter of the way to its centre if that is less
+    offset = 4 * float(mi.math.RayEpsilon) * (1 + np.abs(positions[border]).max(axis=1, keepdims=True))
     moved = positions.copy()
     moved[border] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
     # two vertices may differ only in the side to which they moved: where two meshes meet
@@ -135,7 +123,7 @@ class VertexRays:
     directions: NDArray[np.float32]
     missed: NDArray[np.bool_]
 
-    def chosen(self, vertices: NDArray[np.integer]) -> VertexRays:
+    def take(self, vertices: NDArray[np.integer]) -> VertexRays:
         """The rays of some vertices."""
         return VertexRays(self.origins[vertices], self.directions[vertices], self.missed[vertices])
 
@@ -154,15 +142,19 @@ def vertex_rays(scene: mi.Scene) -> VertexRays:
     hundredth of its size inside. The result is verified by tracing; the vertices that fail are tried again on their
     other triangles and from other heights.
     """
-    vertices, triangles = _merged(scene)
+    # A ray reaches a vertex from just above one of its triangles: this far from the corner towards the triangle's
+    # centre (barycentric), and from this height over it (in units of the scene's longest side). Later pairs are for
+    # vertices that the first ones miss (slivers, surfaces in contact).
+    approaches = ((1e-2, 2e-4), (3e-2, 1e-4), (1e-1, 3e-5), (3e-2, 1e-3))
+    vertices, triangles = _merge(scene)
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     owners, rank, corners = _triangles_of_vertices(vertices, triangles)
     origins = np.zeros_like(vertices)
     directions = np.zeros_like(vertices)
     missing = np.ones(len(vertices), dtype=bool)
-    for attempt in range(len(_APPROACHES) * int(rank.max(initial=0) + 1)):
-        step, height = _APPROACHES[attempt % len(_APPROACHES)]
-        chosen = missing[owners] & (rank == attempt // len(_APPROACHES))  # one corner per vertex at most
+    for attempt in range(len(approaches) * int(rank.max(initial=0) + 1)):
+        step, height = approaches[attempt % len(approaches)]
+        chosen = missing[owners] & (rank == attempt // len(approaches))  # one corner per vertex at most
         if not chosen.any():
             continue
         ids = owners[chosen]
@@ -178,7 +170,7 @@ def vertex_rays(scene: mi.Scene) -> VertexRays:
     return VertexRays(origins, directions, missing)
 
 
-def _merged(scene: mi.Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _merge(scene: mi.Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Concatenate all meshes: vertices (n_v, 3) and triangles (n_t, 3) with global indices."""
     vertices, triangles, offset = [], [], 0
     for shape in scene.shapes():

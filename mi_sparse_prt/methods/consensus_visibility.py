@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
+from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -36,7 +36,7 @@ def by_consensus(scene: Scene, direct: DirectSolver, clock: Stopwatch) -> Consen
 
         state = Consensus(direct.points.normals, AngularGrid(direct.lighting), trace)
         for mesh in scene.meshes:
-            by_levels(state, surface_of(scene, direct, mesh))
+            sample_by_levels(state, surface_of(scene, direct, mesh))
     return state
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.measurement.neighbours import Neighbours, renumbered, surface_neighbours
+from mi_sparse_prt.measurement.neighbours import Neighbours, renumber, surface_neighbours
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
 from mi_sparse_prt.scene.scene import Mesh, Scene
 
@@ -32,7 +32,7 @@ class Neighbourhood:
 
     def dense_around_sparse(self, dense: Dense) -> NDArray[np.int32]:
         """Neighbours (n_sparse, k) of the sparse vertices, by their names in the scene; -1 where there are fewer."""
-        return renumbered(self.near_sparse, dense.ids)
+        return renumber(self.near_sparse, dense.ids)
 
     def around(self, scene: Scene) -> NDArray[np.int32]:
         """The nearest of all vertices (n, k) around each vertex, by their names in the scene."""
@@ -40,7 +40,7 @@ class Neighbourhood:
         p, n = scene.normalised_positions[inside], scene.normals[inside]
         around = surface_neighbours(p, n, p, n, AROUND + 1)
         # the first is the vertex itself
-        return renumbered(around.ids[:, 1:], np.arange(inside.start, inside.stop))
+        return renumber(around.ids[:, 1:], np.arange(inside.start, inside.stop))
 
 
 def neighbourhoods(

@@ -13,7 +13,7 @@ from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
-from mi_sparse_prt.sampling.spatial import choose_dense
+from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import Estimate, PathSolver
@@ -76,11 +76,8 @@ class DenseSampler:
                 self.scene.normalised_positions[inside],
                 self.direct.points.keys[inside],
                 lambda ids: self.add(ids + start),
-                fraction,
-                step,
-                radius,
-                power=power,
-                seed=seed,
+                SpatialSampling(fraction, step, radius, power=power),
+                seed,
             )
         for phase, sign in (("spatial_sampling", 1), ("rank", -1)):
             self.clock.add(phase, sign * samples.seconds["choice"])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import counts
+from mi_sparse_prt.core.bits import count_bits
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.methods.brute_force import exact_direct, path_traced
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
@@ -109,7 +109,7 @@ class Execution:
 
     def _consensus(self) -> MethodResult:
         state = by_consensus(self._scene, self._solver, self._clock)
-        rays = int(counts(state.evaluated).sum())
+        rays = int(count_bits(state.evaluated).sum())
         bits = Visibility(state.visible, self._scene.normals, self._solver.lighting)
         return MethodResult(bits, None, rays, {"direct": rays, "indirect": 0}, {"direct": rays})
 

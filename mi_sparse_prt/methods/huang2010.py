@@ -16,7 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.bits import counts, pack
+from mi_sparse_prt.core.bits import count_bits, pack
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.io.checkpoint import Checkpoint
@@ -29,7 +29,7 @@ from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.features import best_features
+from mi_sparse_prt.sampling.features import choose_features
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -51,7 +51,7 @@ def best_of_each_vertex(
     dense: Dense, mean: NDArray[np.float32]
 ) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
     """The paper's columns (section 5.2): 350 features of each sparse vertex's own neighbours."""
-    return lambda near: best_features(near, mean, dense.rows.features, DIRECTIONS)
+    return lambda near: choose_features(near, mean, dense.rows.features, DIRECTIONS)
 
 
 def huang2010_parts(
@@ -93,7 +93,7 @@ def huang2010_parts(
     quarter = np.zeros(direct.lighting.n_directions, bool)
     quarter[grid.texels] = True
     # the paper counts the whole grid, below the horizon too
-    per_dense = counts(dense.rows.evaluated | pack(quarter))
+    per_dense = count_bits(dense.rows.evaluated | pack(quarter))
     elements = int(per_dense.sum()) + int(evaluated.sum())
     return MethodResult(
         Interpolated(visibility, weights),
@@ -104,7 +104,7 @@ def huang2010_parts(
             "indirect": len(dense.ids) * len(grid.texels) + int(evaluated.sum()) if indirect else 0,
         },
         {
-            "direct": int(counts(dense.rows.evaluated).sum()) + int(evaluated.sum()),
+            "direct": int(count_bits(dense.rows.evaluated).sum()) + int(evaluated.sum()),
             "indirect_paths": (len(dense.ids) * len(grid.texels) + int(evaluated.sum())) * indirect.spp
             if indirect
             else 0,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import counts, pack
+from mi_sparse_prt.core.bits import count_bits, pack
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.methods.dense_neighbourhoods import neighbourhoods
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
@@ -117,10 +117,10 @@ def _account(
     """The parts, and how many elements of each were evaluated."""
     quarter = np.zeros(direct.lighting.n_directions, bool)
     quarter[grid.texels] = True
-    either = counts(state.evaluated)
+    either = count_bits(state.evaluated)
     if part is not None:
-        either[dense.ids] = counts(state.evaluated[dense.ids] | pack(quarter))
-    rays = int(counts(state.evaluated).sum())
+        either[dense.ids] = count_bits(state.evaluated[dense.ids] | pack(quarter))
+    rays = int(count_bits(state.evaluated).sum())
     parts = MethodResult(
         Visibility(state.visible, scene.normals, direct.lighting),
         part,

@@ -15,8 +15,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.bits import Bits, listed, pack
+from mi_sparse_prt.core.bits import Bits, list_bits, pack
 from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.ragged import concatenate_ranges, row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.neighbours import Neighbours
@@ -24,10 +25,10 @@ from mi_sparse_prt.methods.dense_neighbourhoods import Neighbourhood
 from mi_sparse_prt.methods.dense_sampling import Dense, indirect_of
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.upsampled import Upsampled
-from mi_sparse_prt.reconstruction.denoising import DenoisedRows, denoised, smoothed
+from mi_sparse_prt.reconstruction.denoising import DenoisedRows, denoise_rows, smooth_rows
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
-from mi_sparse_prt.reconstruction.ridge import System, about, best_deviation, correction
+from mi_sparse_prt.reconstruction.ridge import System, choose_deviation, fit_correction, shift_to_prior
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -84,7 +85,7 @@ def indirect_part(
         counts.append(present.sum(axis=1))
         columns.append(near.ids[present])
         values.append(corrected[present])
-    starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+    starts = row_starts(np.concatenate(counts))
     entries = np.concatenate(values), np.concatenate(columns), starts
     weights = scipy.sparse.csr_array(entries, shape=(len(scene.positions), len(dense.ids)))
     for file in kept:
@@ -124,7 +125,7 @@ def _dense_rows(
             smoothing = _smoothing(dense.ids[chosen] - group.mesh.vertices.start, chosen.start, *prior)
             for c in range(solver.channels):
                 mean, variance = rows.mean[..., c], rows.variance[..., c]
-                factors = _with_sums_of(mean, smoothed(denoised(mean, variance), smoothing))
+                factors = _with_sums_of(mean, smooth_rows(denoise_rows(mean, variance), smoothing))
                 np.matmul(*factors, out=density[chosen, :, c])
     return density, noise, files
 
@@ -138,7 +139,7 @@ def _smoothing(
     """
     ids, weights = near.ids[rows], prior[rows]
     present = ids >= 0
-    starts = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    starts = row_starts(present.sum(axis=1))
     entries = weights[present], ids[present] - first, starts
     return scipy.sparse.csr_array(entries, shape=(len(rows), len(rows)))
 
@@ -216,7 +217,7 @@ class _Fit:
         pilot = np.sort(group.sparse[order[:PILOT]])
         halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start], 2)
         with self._clock.phase("solver"):
-            deviation = best_deviation((halves[0], halves[1]), noise)
+            deviation = choose_deviation((halves[0], halves[1]), noise)
         if deviation == 0:
             return weights
         for ids in self._batches(group, pilot, progress):
@@ -224,7 +225,7 @@ class _Fit:
                 halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start], 1)
             with self._clock.phase("solver"):
                 system = sum(halves[1:], halves[0])
-                weights[ids - start] += correction(system, noise, deviation).astype(np.float32)
+                weights[ids - start] += fit_correction(system, noise, deviation).astype(np.float32)
         return weights
 
     @staticmethod
@@ -242,13 +243,13 @@ class _Fit:
     ) -> tuple[list[System], NDArray[np.float64]]:
         """Systems of every so many samples of some vertices, and the noise of one sample of each, (n,)."""
         with self._clock.phase("system"):
-            rows, texels = listed(self._evaluated[ids] & pack(self._place >= 0))
+            rows, texels = list_bits(self._evaluated[ids] & pack(self._place >= 0))
         with self._clock.phase("sparse_paths"):
             found = self._solver.elements(ids[rows].astype(np.uint32), texels)
         self.elements += len(rows)
         with self._clock.phase("system"):
             count = np.bincount(rows, minlength=len(ids))
-            at = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+            at = concatenate_ranges(np.zeros(len(ids), np.int64), count)[1]  # place of each sample in its row
             directions = np.full((len(ids), max(2, int(count.max(initial=0)))), -1, np.int32)
             directions[rows, at] = self._place[texels]
             values = np.zeros((self._solver.channels, *directions.shape), np.float32)
@@ -272,7 +273,7 @@ class _Fit:
         taken, a = np.ascontiguousarray(directions), prior.astype(np.float64)
         count = (taken >= 0).sum(axis=1)
         systems = [
-            about(a, *normal_equations(rows, near, taken, np.ascontiguousarray(y)), count)
+            shift_to_prior(a, *normal_equations(rows, near, taken, np.ascontiguousarray(y)), count)
             for rows, y in zip(self._rows, values, strict=True)
         ]
         return sum(systems[1:], systems[0])

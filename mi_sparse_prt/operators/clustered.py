@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import in_blocks
+from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
@@ -111,9 +111,9 @@ class Clustered(Operator):
         """Of means (k, any) and of basis vectors (k, b, any) with vectors (n_directions, any)."""
         scaled = vectors * self._scale()[:, None]
         k, b, m = self.bases.shape
-        return in_blocks(self.means, scaled), in_blocks(self.bases.reshape(k * b, m), scaled).reshape(
-            k, b, -1
-        )
+        return multiply_converted(self.means, scaled), multiply_converted(
+            self.bases.reshape(k * b, m), scaled
+        ).reshape(k, b, -1)
 
     def _combined(self, means: Floats, products: Floats, channels: slice = slice(None)) -> Floats:
         """What rows have where means have (k, any) and basis vectors (k, b, any): (n, channels, any)."""

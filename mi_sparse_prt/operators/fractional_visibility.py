@@ -15,6 +15,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bit_of, bits_at
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.visibility import check_bits
@@ -82,19 +83,15 @@ class FractionalVisibility(Operator):
         return _relight(self.bits, *listed, self.normals, directions, ramps, power)
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> FractionalVisibility:
-        bits, shares, first = self.bits.copy(), self.shares.copy(), self.starts[points]
+        bits, shares = self.bits.copy(), self.shares.copy()
         bits[points] &= open
-        lengths = self.starts[points + 1] - first
-        row = np.repeat(np.arange(len(lengths)), lengths)
-        entries = np.arange(len(row)) + (first - np.cumsum(lengths) + lengths)[row]
+        _, row, entries = select_rows(self.starts, points)
         shares[entries] *= bits_at(open, row, self.texels[entries]).astype(np.uint8)
         return replace(self, bits=bits, shares=shares)
 
     def take(self, source: Ids) -> FractionalVisibility:
         source = np.asarray(source)
-        counts = np.diff(self.starts)[source]
-        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        entries = np.arange(starts[-1]) + np.repeat(self.starts[:-1][source] - starts[:-1], counts)
+        starts, _, entries = select_rows(self.starts, source)
         return replace(
             self,
             bits=self.bits[source],

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar, inverse_haar
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
@@ -94,9 +95,7 @@ class HaarRows(Operator):
     def take(self, source: Ids) -> HaarRows:
         channels = self.scales.shape[1]
         lists = (np.asarray(source, np.int64)[:, None] * channels + np.arange(channels)).ravel()
-        counts = np.diff(self.starts)[lists]
-        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        entries = np.arange(starts[-1]) + np.repeat(self.starts[:-1][lists] - starts[:-1], counts)
+        starts, _, entries = select_rows(self.starts, lists)
         return replace(
             self,
             starts=starts,

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
@@ -90,10 +91,7 @@ def row_entries(
     matrix: scipy.sparse.csr_array, rows: Ids
 ) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.floating]]:
     """Position in ``rows``, column and value of all entries of these rows of a matrix."""
-    counts = np.diff(matrix.indptr)[rows]
-    position = np.repeat(np.arange(len(rows)), counts)
-    within = np.arange(len(position)) - np.repeat(np.cumsum(counts) - counts, counts)
-    entry = matrix.indptr[rows][position] + within
+    _, position, entry = select_rows(matrix.indptr, rows)
     return position, matrix.indices[entry], matrix.data[entry]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, unpack
-from mi_sparse_prt.core.block_products import in_blocks
+from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
@@ -55,7 +55,7 @@ class MeanCosine(Operator):
         return (self.fixed[ids, texels] * self._weights()[texels])[:, None]
 
     def _apply_same(self, x: Floats) -> Floats:
-        return in_blocks(self.fixed, x * self._weights()[:, None])[:, None]
+        return multiply_converted(self.fixed, x * self._weights()[:, None])[:, None]
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> MeanCosine:
         fixed = self.fixed.copy()

@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, bits_at
-from mi_sparse_prt.core.block_products import MADE, ROWS
-from mi_sparse_prt.core.threads import overlapped
+from mi_sparse_prt.core.threads import run_overlapped
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 Ids = NDArray[np.integer]
 Floats = NDArray[np.float32]
+
+ROWS = 2048  # expanded at a time
+CACHED_ROWS = 256  # expanded at a time where some of them stay in the cache until they are used
 
 
 class Operator(ABC):
@@ -176,14 +178,14 @@ class Operator(ABC):
             for c in range(channels):
                 result[some[0] : some[-1] + 1, c] = made[..., c] @ x
 
-        for _ in overlapped(partial(multiply, some, self.rows(some)) for some in self._blocks(MADE)):
+        for _ in run_overlapped(partial(multiply, some, self.rows(some)) for some in self._blocks(CACHED_ROWS)):
             pass
         return result
 
     def _apply_each(self, x: Floats) -> Floats:
         """Products (rows, 3, k) with vectors (n_directions, 3, k) of each channel."""
         result = np.empty((self.shape[0], 3, x.shape[2]), np.float32)
-        for some in self._blocks(MADE):
+        for some in self._blocks(CACHED_ROWS):
             made = self.rows(some)
             for c in range(3):
                 result[some, c] = made[..., c] @ x[:, c]

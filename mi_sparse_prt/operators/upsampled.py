@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import in_blocks
+from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.interpolated import row_entries, summed_entries
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
@@ -69,13 +69,13 @@ class Upsampled(Operator):
 
     def _apply_same(self, x: Floats) -> Floats:
         coarse = self.upsampling.T @ (x * self.lighting.solid_angles[:, None])  # [coarse, vector]
-        channels = [in_blocks(self.density[..., c], coarse) for c in range(self.density.shape[2])]
+        channels = [multiply_converted(self.density[..., c], coarse) for c in range(self.density.shape[2])]
         return np.stack(channels, axis=1)
 
     def _apply_each(self, x: Floats) -> Floats:
         light = x * self.lighting.solid_angles[:, None, None]
         coarse = [self.upsampling.T @ light[:, c] for c in range(3)]  # of [coarse, vector]
-        return np.stack([in_blocks(self.density[..., c], coarse[c]) for c in range(3)], axis=1)
+        return np.stack([multiply_converted(self.density[..., c], coarse[c]) for c in range(3)], axis=1)
 
     def take(self, ids: Ids) -> Upsampled:
         return replace(self, density=self.density[ids])

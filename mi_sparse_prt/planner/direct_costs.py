@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mi_sparse_prt.core.bits import Bits, counts, listed, unpack
+from mi_sparse_prt.core.bits import Bits, count_bits, list_bits, unpack
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.consensus import Consensus, Surface, by_levels
+from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
@@ -77,10 +77,10 @@ def consensus_cost(scene: Scene, direct: DirectSolver, held: PilotElements, seed
     first = 0
     for patch in patches:
         p = scene.normalised_positions[patch]
-        by_levels(state, Surface(first, p, scene.normals[patch], direct.points.keys[patch]))
+        sample_by_levels(state, Surface(first, p, scene.normals[patch], direct.points.keys[patch]))
         first += len(patch)
     asked, seen, ids = state.evaluated[inner], state.visible[inner], ids[inner]
-    rays = float(stands_for @ counts(asked))
+    rays = float(stands_for @ count_bits(asked))
     seconds = rays * _seconds_per_ray(direct, ids, asked) + OVERHEAD * len(direct.points)
     power = (scene.albedo[ids] ** 2).sum(axis=1) * stands_for
     exact = direct.rows(ids.astype(np.uint32)).astype(np.uint32, copy=False)
@@ -114,7 +114,7 @@ def _patches(
 
 def _seconds_per_ray(direct: DirectSolver, ids: NDArray[np.int64], asked: Bits) -> float:
     """Of rays that consensus asks for, with others of the same vertices around them."""
-    rows, texels = listed(asked)
+    rows, texels = list_bits(asked)
     vertices = ids[rows].astype(np.uint32)
     start = time.perf_counter()
     direct.visible(vertices, texels)

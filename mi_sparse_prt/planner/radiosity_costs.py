@@ -13,7 +13,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.sparse_product import product
+from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.reconstruction.node_placement import NODES
 from mi_sparse_prt.scene.scene import Scene
@@ -209,7 +209,7 @@ def _seconds_of_products(direct: DirectSolver, rays: scipy.sparse.csr_array) -> 
     light = rng.random((len(direct.points), WIDTH), np.float32)
     rows = scipy.sparse.vstack([rays] * REPEATED, format="csr")
     dense = _least_seconds(lambda: block @ mixing) / (WIDTH * block.size)
-    sparse = _least_seconds(lambda: product(rows, light)) / (WIDTH * max(rows.nnz, 1))
+    sparse = _least_seconds(lambda: multiply_sparse(rows, light)) / (WIDTH * max(rows.nnz, 1))
     return dense, sparse
 
 

@@ -11,9 +11,6 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import load_environment
 
-# Distance of the light in units of 1 + |position|: far behind any ceiling, near enough for float32
-FAR = 1e6
-
 
 class CubemapEmitter(mi.Emitter):
     r"""Cubemap environment emitter (:monosp:`cubemap`)
@@ -140,8 +137,8 @@ class CubemapEmitter(mi.Emitter):
     ) -> tuple[mi.DirectionSample3f, mi.Color3f]:
         n = self.resolution
         u = dr.minimum(sample, dr.one_minus_epsilon(mi.Float))
-        row, v = _sampled(self._rows, mi.UInt32(0), 6 * n, u.y, active)
-        col, w = _sampled(self._columns, row * (n + 1), n, u.x, active)
+        row, v = _invert_cumulative(self._rows, mi.UInt32(0), 6 * n, u.y, active)
+        col, w = _invert_cumulative(self._columns, row * (n + 1), n, u.x, active)
         face = row // n
         s = (mi.Float(col) + w) * (2 / n) - 1
         t = (mi.Float(row - face * n) + v) * (2 / n) - 1
@@ -150,8 +147,9 @@ class CubemapEmitter(mi.Emitter):
         ds = dr.zeros(mi.DirectionSample3f)
         ds.d = face_direction(face, s, t)
         ds.n = -ds.d
-        # The scene's extent is not known here, so the distance comes from the point's
-        ds.dist = FAR * (1 + dr.max(dr.abs(it.p)))
+        # The scene's extent is not known here, so the distance comes from the point's: far behind any ceiling, and
+        # near enough for float32
+        ds.dist = 1e6 * (1 + dr.max(dr.abs(it.p)))
         ds.p = it.p + ds.d * ds.dist
         ds.time = it.time
         ds.delta = False
@@ -228,7 +226,7 @@ def _cumulative(power: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.pad(sums / sums[:, -1:], ((0, 0), (1, 0))).astype(np.float32)
 
 
-def _sampled(
+def _invert_cumulative(
     cumulative: mi.Float, first: mi.UInt32, size: int, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.UInt32, mi.Float]:
     """Invert the running sums at `first`, ..., `first + size`: the entry u falls into, and where in it (0 to 1)."""

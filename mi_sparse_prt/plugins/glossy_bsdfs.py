@@ -1,4 +1,4 @@
-r"""The BSDFs `phong` and `ashikhmin_shirley` of [HR10] (Figures 17 to 19), which Mitsuba 3 does not have."""
+"""The BSDFs `phong` and `ashikhmin_shirley` of [HR10] (Figures 17 to 19), which Mitsuba 3 does not have."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import mitsuba as mi
 import numpy as np
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.plugins.reflective_bsdf import (
+    ReflectiveBSDF,
+    phong_lobe_density,
+    phong_lobe_power,
+    sample_phong_lobe,
+)
 
-SMOOTHEST = 1e5  # exponent: beyond, float32 does not resolve the lobe
-MOST_UNEVEN = 0.02  # the least share of samples of a lobe that reflects at all
 
-
-class GlossyBSDF(mi.BSDF):
+class GlossyBSDF(ReflectiveBSDF):
     """A diffuse and a specular lobe on the front of a surface, all in the local frame.
 
     Subclasses give both lobes and sample the specular one. Which lobe is sampled is chosen by the means of both
@@ -53,11 +56,11 @@ class GlossyBSDF(mi.BSDF):
         self._share = self._specular_share()
 
     def _specular_share(self) -> float:
-        """Of the samples."""
-        diffuse, specular = _mean(self.diffuse), _mean(self.specular)
+        """Of the samples; a lobe that reflects at all has at least one in fifty."""
+        diffuse, specular, least = _mean(self.diffuse), _mean(self.specular), 0.02
         if min(diffuse, specular) <= 0:
             return float(specular > 0)
-        return min(max(specular / (diffuse + specular), MOST_UNEVEN), 1 - MOST_UNEVEN)
+        return min(max(specular / (diffuse + specular), least), 1 - least)
 
     def _probability(self, context: mi.BSDFContext) -> tuple[bool, bool, float]:
         """Whether the specular and the diffuse lobe are asked for, and the share of samples of the first."""
@@ -65,56 +68,17 @@ class GlossyBSDF(mi.BSDF):
         diffuse = context.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
         return specular, diffuse, self._share if specular and diffuse else float(specular)
 
-    def sample(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+    def sample_direction(
+        self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
         specular = sample1 < self._probability(context)[2]
-        bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = dr.select(
-            specular, self.sample_lobe(si, sample2), mi.warp.square_to_cosine_hemisphere(sample2)
-        )
-        value, bs.pdf = self.eval_pdf(context, si, bs.wo, active)
-        bs.eta = 1.0
-        bs.sampled_component = dr.select(specular, mi.UInt32(0), mi.UInt32(1))
-        bs.sampled_type = dr.select(
-            specular,
-            mi.UInt32(int(mi.BSDFFlags.GlossyReflection)),
-            mi.UInt32(int(mi.BSDFFlags.DiffuseReflection)),
-        )
-        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+        cosine = mi.warp.square_to_cosine_hemisphere(sample2)
+        direction = dr.select(specular, self.sample_lobe(si, sample2), cosine)
+        return direction, dr.select(specular, mi.UInt32(0), mi.UInt32(1))
 
-    def eval(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Color3f:
-        return self.eval_pdf(context, si, wo, active)[0]
-
-    def pdf(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Float:
-        return self.eval_pdf(context, si, wo, active)[1]
-
-    def eval_pdf(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
+    def reflect(
+        self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        cosine = mi.Frame3f.cos_theta(wo)
-        active &= (mi.Frame3f.cos_theta(si.wi) > 0) & (cosine > 0)
         specular, diffuse, share = self._probability(context)
         value, density = mi.Color3f(0), mi.Float(0)
         if specular:
@@ -123,10 +87,7 @@ class GlossyBSDF(mi.BSDF):
         if diffuse:
             value += self.diffuse_lobe(si, wo, active)
             density += (1 - share) * mi.warp.square_to_cosine_hemisphere_pdf(wo)
-        return dr.select(active, value * cosine, 0), dr.select(active, density, 0)
-
-    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
-        return self.diffuse.eval(si, active)
+        return value * mi.Frame3f.cos_theta(wo), density
 
     def lobe(
         self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
@@ -194,14 +155,12 @@ class Phong(GlossyBSDF):
     def lobe(
         self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        power = dr.maximum(dr.dot(mi.reflect(si.wi), wo), 0) ** self.exponent
+        power = phong_lobe_power(si.wi, self.exponent, wo)
         value = self.specular.eval(si, active) * ((self.exponent + 2) * dr.inv_two_pi * power)
-        return value, (self.exponent + 1) * dr.inv_two_pi * power
+        return value, phong_lobe_density(power, self.exponent)
 
     def sample_lobe(self, si: mi.SurfaceInteraction3f, sample: mi.Point2f) -> mi.Vector3f:
-        cosine = (1 - sample.y) ** (1 / (self.exponent + 1))
-        sine, (s, c) = dr.safe_sqrt(1 - cosine * cosine), dr.sincos(dr.two_pi * sample.x)
-        return mi.Frame3f(mi.reflect(si.wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
+        return sample_phong_lobe(si.wi, self.exponent, sample)
 
     def diffuse_lobe(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
         return self.diffuse.eval(si, active) * dr.inv_pi
@@ -314,7 +273,7 @@ def _mean(texture: mi.Texture) -> float:
 
 def _exponent(props: mi.Properties, name: str, default: float) -> mi.Float:
     """A parameter of the plugin; opaque, so that another value compiles no kernel."""
-    value = float(props.get(name, default))
-    if not 0 <= value <= SMOOTHEST:
-        raise PrtError(f"{props.plugin_name()}: {name} is {value:g}; give 0 to {SMOOTHEST:g}")
+    value, largest = float(props.get(name, default)), 1e5  # beyond, float32 does not resolve the lobe
+    if not 0 <= value <= largest:
+        raise PrtError(f"{props.plugin_name()}: {name} is {value:g}; give 0 to {largest:g}")
     return dr.opaque(mi.Float, value)

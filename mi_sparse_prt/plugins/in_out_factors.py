@@ -7,16 +7,22 @@ import mitsuba as mi
 import numpy as np
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.plugins.reflective_bsdf import (
+    ReflectiveBSDF,
+    phong_lobe_density,
+    phong_lobe_power,
+    sample_phong_lobe,
+)
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
-from mi_sparse_prt.reflection.factor_tables import incident_tables, looked_up, outgoing_tables
+from mi_sparse_prt.reflection.factor_tables import incident_tables, look_up, outgoing_tables
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
 
 LOBE = 10.0  # exponent of the lobe that is sampled: wider than most that few factors can tell
 LOBE_SHARE = 0.5  # of the samples; the others are cosine-distributed
 
 
-class InOutFactors(mi.BSDF):
-    r"""LowRank BSDF (:monosp:`in_out_factors`)
+class InOutFactors(ReflectiveBSDF):
+    r"""In-out factors BSDF (:monosp:`in_out_factors`)
     ------------------------------------------
 
     A diffuse part and a sum of products ([HR10] eq. 2 and 3): rho(w_i, w_o) cos(w_i) = R / pi cos(w_i) +
@@ -27,7 +33,7 @@ class InOutFactors(mi.BSDF):
     `max_depth`.)
 
     Tables hold a direction (x, y, z) at (x, y) / (1 + z), the square [-1, 1]^2 with corners at its edges
-    (`measurement.factor_tables`), row by row in y; values between entries are bilinear. Samples are half
+    (`reflection.factor_tables`), row by row in y; values between entries are bilinear. Samples are half
     cosine-distributed, half of a Phong lobe of exponent 10.
 
     .. list-table::
@@ -91,64 +97,27 @@ class InOutFactors(mi.BSDF):
         super().parameters_changed(keys)
         self._rebuild()
 
-    def sample(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool = True,
-    ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
-        bs = dr.zeros(mi.BSDFSample3f)
-        cosine = mi.warp.square_to_cosine_hemisphere(sample2)
-        bs.wo = dr.select(sample1 < LOBE_SHARE, _lobe_direction(si.wi, sample2), cosine)
-        value, bs.pdf = self.eval_pdf(context, si, bs.wo, active)
-        bs.eta = 1.0
-        bs.sampled_component = 0
-        bs.sampled_type = mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
-        return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+    def sample_direction(
+        self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.UInt32]:
+        lobe, cosine = sample_phong_lobe(si.wi, LOBE, sample2), mi.warp.square_to_cosine_hemisphere(sample2)
+        return dr.select(sample1 < LOBE_SHARE, lobe, cosine), mi.UInt32(0)
 
-    def eval(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Color3f:
-        return self.eval_pdf(context, si, wo, active)[0]
-
-    def pdf(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Float:
-        return self.eval_pdf(context, si, wo, active)[1]
-
-    def eval_pdf(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
+    def reflect(
+        self, context: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        cosine = mi.Frame3f.cos_theta(wo)
-        active &= (mi.Frame3f.cos_theta(si.wi) > 0) & (cosine > 0)
         active &= context.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
         # Mitsuba's wi is where the light leaves for, wo where it comes from
         into = self._looked_up(self._f, wo, active)
         glossy = [dr.dot(into, self._looked_up(g, si.wi, active)) for g in self._g]
+        cosine = mi.Frame3f.cos_theta(wo)
         value = mi.Color3f(*glossy) + self.diffuse.eval(si, active) * (cosine * dr.inv_pi)
-        density = LOBE_SHARE * _lobe_density(si.wi, wo)
+        density = LOBE_SHARE * phong_lobe_density(phong_lobe_power(si.wi, LOBE, wo), LOBE)
         density += (1 - LOBE_SHARE) * mi.warp.square_to_cosine_hemisphere_pdf(wo)
         return dr.select(active, value, 0), dr.select(active, density, 0)
 
-    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
-        return self.diffuse.eval(si, active)
-
     def _looked_up(self, table: mi.Float, local: mi.Vector3f, active: mi.Bool) -> mi.ArrayXf:
-        return mi.ArrayXf(looked_up(table, self._size, self._terms, mi.UInt32(0), local, active))
+        return mi.ArrayXf(look_up(table, self._size, self._terms, mi.UInt32(0), local, active))
 
     def to_string(self) -> str:
         return f"InOutFactors[terms={self._terms}, size={self._size}, diffuse={self.diffuse}]"
@@ -190,14 +159,3 @@ def _table(props: mi.Properties, name: str) -> mi.TensorXf:
     if not np.isfinite(values).all():
         raise PrtError(f"in_out_factors: {name} has values that are NaN or infinite; repair it")
     return mi.TensorXf(values)
-
-
-def _lobe_direction(wi: mi.Vector3f, sample: mi.Point2f) -> mi.Vector3f:
-    """Of a Phong lobe around the mirrored direction; it may be below the surface."""
-    cosine = (1 - sample.y) ** (1 / (LOBE + 1))
-    sine, (s, c) = dr.safe_sqrt(1 - cosine * cosine), dr.sincos(dr.two_pi * sample.x)
-    return mi.Frame3f(mi.reflect(wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
-
-
-def _lobe_density(wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
-    return (LOBE + 1) * dr.inv_two_pi * dr.maximum(dr.dot(mi.reflect(wi), wo), 0) ** LOBE

@@ -9,12 +9,31 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
-SMALL = 256  # rows or columns, up to which no precision is given up for speed
-SKETCH = 192  # singular vectors looked for first; scenes have had at most 142
-PASSES = 4  # over the Gram matrix; errors of dense rows are then within 0.3% of those of exact vectors
-BALANCINGS = 5  # of rows and columns in turn; the deviations settle within 1%
-LEAST_ROW, LEAST_COLUMN = 0.02, 0.3  # least deviation, in means of all
-BLOCK = 4096  # rows scaled at a time
+
+@dataclass(frozen=True)
+class DenoisingOptions:
+    """How singular vectors above the noise are found.
+
+    Attributes
+    ----------
+    exact : int
+        Rows or columns, up to which no precision is given up for speed.
+    sketch : int
+        Singular vectors looked for first; scenes have had at most 142.
+    passes : int
+        Over the Gram matrix; after 4, errors of dense rows are within 0.3% of those of exact vectors.
+    balancings : int
+        Of rows and columns in turn; after 5, the deviations of the noise have settled within 1%.
+    least_row, least_column : float
+        Least deviation, in means of all.
+    """
+
+    exact: int = 256
+    sketch: int = 192
+    passes: int = 4
+    balancings: int = 5
+    least_row: float = 0.02
+    least_column: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -43,7 +62,9 @@ class DenoisedRows:
         return self.left @ self.right
 
 
-def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> DenoisedRows:
+def denoise_rows(
+    rows: NDArray[np.float32], variance: NDArray[np.float32], options: DenoisingOptions | None = None
+) -> DenoisedRows:
     """The low-rank matrix closest to the one that noisy rows are estimates of.
 
     Parameters
@@ -54,6 +75,7 @@ def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> Denois
         Of each estimate. Taken for a product of one factor per row and one per column, by which the matrix is scaled
         to unit noise: noise that is uneven looks like signal (Landa et al. 2022, "Biwhitening Reveals the Rank of a
         Count Matrix").
+    options : DenoisingOptions, optional
 
     Returns
     -------
@@ -68,8 +90,9 @@ def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> Denois
     """
     if not variance.any():  # nothing to take out, or one path per element: the noise is unknown
         return DenoisedRows(rows, np.eye(rows.shape[1], dtype=np.float32), np.zeros(len(rows), np.float32))
-    by_row, by_column = _deviations(variance)
-    left, values, right = _leading(rows, by_row, by_column)
+    options = options or DenoisingOptions()
+    by_row, by_column = _deviations(variance, options)
+    left, values, right = _leading(rows, by_row, by_column, options)
     n, m = max(rows.shape), min(rows.shape)
     beta, squares = m / n, values.astype(np.float64) ** 2 / n
     shrunk = np.sqrt(np.maximum((squares - beta - 1) ** 2 - 4 * beta, 0)) / squares  # new over old values
@@ -77,7 +100,7 @@ def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> Denois
     return DenoisedRows(left * shrunk.astype(np.float32) * by_row[:, None], right * by_column, noise)
 
 
-def smoothed(rows: DenoisedRows, smoothing: scipy.sparse.csr_array) -> DenoisedRows:
+def smooth_rows(rows: DenoisedRows, smoothing: scipy.sparse.csr_array) -> DenoisedRows:
     """Neighbouring rows averaged wherever that takes away no more than noise.
 
     What smoothing would change is scaled by 1 - (its energy if it were noise) / (its energy), 0 at least, with
@@ -107,7 +130,9 @@ def smoothed(rows: DenoisedRows, smoothing: scipy.sparse.csr_array) -> DenoisedR
     return DenoisedRows(smooth + kept[:, None] * change, rows.right, rows.noise)
 
 
-def _deviations(variance: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _deviations(
+    variance: NDArray[np.float32], options: DenoisingOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Factors of rows (n,) and columns (m,) whose product stands for the standard deviation of the noise.
 
     They make the mean variance of every scaled row and column 1 (Sinkhorn's iteration). No noise counts as a little.
@@ -115,19 +140,22 @@ def _deviations(variance: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDA
     n, m = variance.shape
     rows: NDArray[np.floating] = np.ones(n, np.float32)  # variances
     columns: NDArray[np.floating] = np.ones(m, np.float32)
-    for _ in range(BALANCINGS):
-        columns = _raised((1 / rows) @ variance / np.float32(n), LEAST_COLUMN)
-        rows = _raised(variance @ (1 / columns) / np.float32(m), LEAST_ROW)
+    for _ in range(options.balancings):
+        columns = _raise_to_least((1 / rows) @ variance / np.float32(n), options.least_column)
+        rows = _raise_to_least(variance @ (1 / columns) / np.float32(m), options.least_row)
     return np.sqrt(rows, dtype=np.float32), np.sqrt(columns, dtype=np.float32)
 
 
-def _raised(variance: NDArray[np.floating], least: float) -> NDArray[np.floating]:
+def _raise_to_least(variance: NDArray[np.floating], least: float) -> NDArray[np.floating]:
     mean = float(np.sqrt(variance, dtype=np.float64).mean())
     return np.maximum(variance, np.float32((least * mean) ** 2 or 1.0))
 
 
 def _leading(
-    rows: NDArray[np.float32], by_row: NDArray[np.float32], by_column: NDArray[np.float32]
+    rows: NDArray[np.float32],
+    by_row: NDArray[np.float32],
+    by_column: NDArray[np.float32],
+    options: DenoisingOptions,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Of rows in units of noise: singular vectors times values (n, r), values (r,) and vectors (r, m).
 
@@ -135,15 +163,15 @@ def _leading(
     """
     n, m = rows.shape
     least = np.sqrt(n) + np.sqrt(m)
-    if min(n, m) <= SMALL:
+    if min(n, m) <= options.exact:
         scaled = (rows / by_row[:, None] / by_column).astype(np.float32, copy=False)
         left, values, right = np.linalg.svd(scaled, full_matrices=False)
         found = int((values > least).sum())
         return left[:, :found] * values[:found], values[:found], right[:found]
     if n < m:
-        long, values, short = _leading(rows.T, by_column, by_row)
+        long, values, short = _leading(rows.T, by_column, by_row, options)
         return short.T * values, values, (long / values).T
-    squares, vectors = _above(_gram(rows, by_row, by_column), least**2)
+    squares, vectors = _eigenvectors_above(_gram(rows, by_row, by_column), least**2, options)
     projected = (rows @ (vectors / by_column[:, None])) / by_row[:, None]
     return projected.astype(np.float32, copy=False), np.sqrt(squares), vectors.T
 
@@ -156,24 +184,27 @@ def _gram(
     float32 loses what is 3000 times smaller than the largest singular value; path noise is larger than that.
     """
     gram = np.zeros((rows.shape[1], rows.shape[1]), np.float32)
-    for a in range(0, len(rows), BLOCK):
-        scaled = rows[a : a + BLOCK] / by_row[a : a + BLOCK, None]
+    block = 4096  # rows at a time
+    for a in range(0, len(rows), block):
+        scaled = rows[a : a + block] / by_row[a : a + block, None]
         scaled /= by_column
         gram += scaled.T @ scaled  # NumPy computes half of it
     return gram
 
 
-def _above(gram: NDArray[np.float32], least: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _eigenvectors_above(
+    gram: NDArray[np.float32], least: float, options: DenoisingOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Eigenvalues (r,) above a limit and their vectors (m, r).
 
     By subspace iteration (Halko, Martinsson and Tropp 2011, algorithm 4.4): few rise above the noise, and those that
     hardly do are shrunk to almost nothing. If they are many after all, exactly.
     """
-    basis = np.random.default_rng(0).standard_normal((len(gram), SKETCH), np.float32)
-    for _ in range(PASSES):
-        basis = _orthonormal(gram @ basis)
+    basis = np.random.default_rng(0).standard_normal((len(gram), options.sketch), np.float32)
+    for _ in range(options.passes):
+        basis = _orthonormalise(gram @ basis)
     squares, turned = np.linalg.eigh(basis.T @ (gram @ basis))
-    if (squares > least).sum() <= 0.8 * SKETCH:
+    if (squares > least).sum() <= 0.8 * options.sketch:
         return squares[squares > least], basis @ turned[:, squares > least]
     values, vectors = scipy.linalg.eigh(
         gram, subset_by_value=(least, np.inf), driver="evx", overwrite_a=True, check_finite=False
@@ -181,7 +212,7 @@ def _above(gram: NDArray[np.float32], least: float) -> tuple[NDArray[np.float32]
     return values, vectors
 
 
-def _orthonormal(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+def _orthonormalise(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     """The columns (m, b) made orthonormal, by Cholesky factors of their products: a sixth of the time of a QR.
 
     They square the condition, for which float64 has room unless a column is hardly more than rounding. All by NumPy:

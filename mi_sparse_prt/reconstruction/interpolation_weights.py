@@ -8,10 +8,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.measurement.neighbours import Neighbours
 
-GAUSSIANS = 1.5  # standard deviations (times sqrt 2) at which the farthest neighbour of linear weights is
-NORMAL_UNIT = 2.0  # slopes in normals count from differences of half a unit on
-RIDGE = 0.3  # of slopes, in squared steps between dense vertices
-
 
 def linear_weights(
     neighbours: Neighbours,
@@ -54,6 +50,9 @@ def _linear_weights(
     dense: NDArray[np.floating],
 ) -> NDArray[np.float32]:
     """Of points (n, 6) and dense vertices (m, 6), each a position and a normal."""
+    gaussians = 1.5  # standard deviations (times sqrt 2) at which the farthest neighbour is
+    normal_unit = 2.0  # slopes in normals count from differences of half a unit on
+    ridge = 0.3  # of slopes, in squared steps between dense vertices
     weights = np.zeros(ids.shape, np.float32)
     for i in numba.prange(len(ids)):
         count = 0
@@ -61,17 +60,17 @@ def _linear_weights(
             count += 1
         if count == 0:
             continue
-        reach = max(np.float64(distances[i, count - 1]) / GAUSSIANS, 1e-30)
+        reach = max(np.float64(distances[i, count - 1]) / gaussians, 1e-30)
         near = np.exp(-((distances[i, :count] / reach) ** 2))
         near /= near.sum()
         terms = np.empty((count, 6))  # [neighbour, slope]
         for k in range(count):
             for c in range(6):
-                unit = max(reach / GAUSSIANS, 1e-30) if c < 3 else 1 / NORMAL_UNIT
+                unit = max(reach / gaussians, 1e-30) if c < 3 else 1 / normal_unit
                 terms[k, c] = (dense[ids[i, k], c] - points[i, c]) / unit
         mean = near @ terms
         weighted = (terms - mean) * near.reshape(-1, 1)
-        system = weighted.T @ (terms - mean) + RIDGE * np.eye(6)
+        system = weighted.T @ (terms - mean) + ridge * np.eye(6)
         weights[i, :count] = near - weighted @ np.linalg.solve(system, mean)
     return weights
 

@@ -14,20 +14,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 
 Floats = NDArray[np.float64]
-
-SOLVERS = ("coordinate_descent", "interior_point")
-MAX_STEPS = 1000  # of coordinate descent; about one per unknown is usual
-MAX_NEWTON_STEPS, MAX_BACKTRACKS = 400, 100  # as in the authors' l1_ls.m
-DAMPING = 1e-14  # of a unit diagonal: columns equal but for rounding move together instead of far apart
-SMALLEST = np.finfo(np.float64).tiny
-LONGEST = np.finfo(np.float64).eps ** -0.5  # singular values below sqrt(eps) are lost in a Gram matrix
-BLOCK = 4096  # eigendecompositions at a time
 
 
 @dataclass(frozen=True)
@@ -42,9 +33,9 @@ class Fit:
         What was minimised, at the weights.
     gap : (m,) float64
         Duality gap: the objective is at most so much above its minimum. Without a penalty no better bound than the
-        objective itself is at hand (`l1_fit`), or the closed form makes it 0 (`least_squares_fit`).
+        objective itself is at hand.
     iterations : (m,) int64
-        Coordinates visited, or Newton steps.
+        Coordinates visited.
     """
 
     weights: Floats
@@ -58,13 +49,13 @@ def l1_fit(
     correlation: ArrayLike,
     squared_norm: ArrayLike,
     relative_lambda: float = 1e-2,
-    solver: str = "coordinate_descent",
     tolerance: float = 1e-6,
-    non_negative: bool = False,
+    most_steps: int = 1000,
 ) -> Fit:
     """Minimise ``||A a - y||^2 + lambda ||a||_1`` for many small problems ([HR10] 5.1, [KKL07]).
 
-    A problem's result depends neither on the others, nor on the number of threads.
+    Coordinate descent that moves the steepest coordinate, then all that are not 0 to their common minimum; exactly
+    sparse. A problem's result depends neither on the others, nor on the number of threads.
 
     Parameters
     ----------
@@ -79,14 +70,11 @@ def l1_fit(
         lambda in units of ``||2 A^T y||_inf``, from which on all weights are 0. At 0 it is plain least squares, by the
         steps that the penalised problem takes, ended when no unit column correlates with the residual by more than
         ``tolerance ||y||``.
-    solver : {"coordinate_descent", "interior_point"}
-        The first moves the steepest coordinate, then all that are not 0 to their common minimum; exactly sparse. The
-        second is [KKL07] with direct Newton steps: the reference, hundreds of times slower, nothing exactly 0.
     tolerance : float
         A problem is solved when its duality gap is at most ``tolerance ||y||^2``. Where rounding stops the descent
-        before (columns all but equal, tiny lambda) or 1000 steps do, `Fit.gap` says what was reached.
-    non_negative : bool
-        Weights >= 0, by coordinate descent.
+        before (columns all but equal, tiny lambda) or ``most_steps`` do, `Fit.gap` says what was reached.
+    most_steps : int
+        About one per unknown is usual.
 
     Returns
     -------
@@ -97,63 +85,29 @@ def l1_fit(
     PrtError
         For shapes that do not match, values that are not finite (naming the problem), or options out of range.
     """
-    products = _checked(gram, correlation, squared_norm)
-    if solver not in SOLVERS:
-        raise PrtError(f"solver {solver!r} is unknown; choose one of {', '.join(SOLVERS)}")
-    _check_option("relative_lambda", relative_lambda, relative_lambda >= 0, "0 or more")
-    _check_option("tolerance", tolerance, tolerance > 0, "more than 0")
-    if solver == "interior_point" and (non_negative or relative_lambda == 0):
-        unable = "non_negative=True" if non_negative else "relative_lambda=0"
-        raise PrtError(f"interior_point cannot solve with {unable}; use solver='coordinate_descent'")
-    run = _all_by_descent if solver == "coordinate_descent" else _all_by_interior_point
-    return Fit(*run(*products, float(relative_lambda), float(tolerance), bool(non_negative)))
+    products = check_products(gram, correlation, squared_norm)
+    check_option("relative_lambda", relative_lambda, relative_lambda >= 0, "0 or more")
+    check_option("tolerance", tolerance, tolerance > 0, "more than 0")
+    check_option("most_steps", most_steps, most_steps > 0, "1 or more")
+    return Fit(*_descend_all(*products, float(relative_lambda), float(tolerance), int(most_steps)))
 
 
-def least_squares_fit(
-    gram: ArrayLike, correlation: ArrayLike, squared_norm: ArrayLike, relative_ridge: float = 0.0
-) -> Fit:
-    """Minimise ``||A a - y||^2 + ridge ||a||^2``, by the shortest a where several do.
-
-    Parameters
-    ----------
-    gram, correlation, squared_norm : (m, k, k), (m, k), (m,)
-        As for `l1_fit`.
-    relative_ridge : float
-        Ridge in units of the mean of the Gram matrix's diagonal, over unknowns whose column is not 0.
-
-    Returns
-    -------
-    Fit
-        Eigenvectors whose eigenvalue (plus ridge) is at most k eps times the largest (eps of the Gram matrix's type)
-        carry no weight: columns shorter than sqrt(k eps) of the longest, or closer to each other, are lost in noise.
-        The objective includes the ridge; ``gap`` and ``iterations`` are 0.
-
-    Raises
-    ------
-    PrtError
-        For shapes that do not match, values that are not finite (naming the problem), or a negative ridge.
-    """
-    G, r, s, eps = _checked(gram, correlation, squared_norm)
-    _check_option("relative_ridge", relative_ridge, relative_ridge >= 0, "0 or more")
-    m, k = r.shape
-    weights, objective = np.zeros((m, k)), s.copy()
-    for a in range(0, m if k else 0, BLOCK):
-        part = slice(a, a + BLOCK)
-        weights[part], objective[part] = _by_eigenvectors(
-            G[part].astype(np.float64), r[part], s[part], relative_ridge, k * eps
-        )
-    return Fit(weights, objective, np.zeros(m), np.zeros(m, dtype=np.int64))
-
-
-def _check_option(name: str, value: float, valid: bool, wanted: str) -> None:
+def check_option(name: str, value: float, valid: bool, wanted: str) -> None:
+    """Refuse an option that is not finite or not ``wanted``."""
     if not (valid and np.isfinite(value)):
         raise PrtError(f"{name} is {value}; pass a finite number, {wanted}")
 
 
-def _checked(
+def check_products(
     gram: ArrayLike, correlation: ArrayLike, squared_norm: ArrayLike
 ) -> tuple[NDArray, Floats, Floats, float]:
-    """The products as arrays that compiled code takes, and the rounding of the Gram matrix."""
+    """The products as arrays that compiled code takes, and the rounding of the Gram matrix.
+
+    Raises
+    ------
+    PrtError
+        For shapes that do not match, or values that are not finite (naming the problem).
+    """
     G = np.asarray(gram)
     G = np.ascontiguousarray(G, dtype=np.float32 if G.dtype == np.float32 else np.float64)
     r = np.array(correlation, dtype=np.float64, order="C", ndmin=1)
@@ -174,16 +128,17 @@ def _checked(
 
 
 @numba.njit(cache=True)
-def _normalised(
+def normalise(
     G: NDArray, r: Floats, s: float, eps: float, relative_lambda: float
 ) -> tuple[NDArray[np.int64], Floats, Floats, Floats, Floats]:
     """Ids (n,) of the unknowns that have a column (none where y is 0), Gram matrix (n, n) and correlations (n,) of unit
     columns and y, half the penalties (n,), and which weight (n,) a unit of each unknown is.
     """
+    smallest = 2.2250738585072014e-308  # of normal numbers
     used = np.empty(len(r), dtype=np.int64)
     n = 0
     for i in range(len(r)):
-        if s >= SMALLEST and G[i, i] >= SMALLEST:
+        if s >= smallest and G[i, i] >= smallest:
             used[n] = i
             n += 1
     used = used[:n]
@@ -202,9 +157,7 @@ def _normalised(
 
 
 @numba.njit(cache=True)
-def _objective_and_gap(
-    b: Floats, c: Floats, q: Floats, half: Floats, non_negative: bool
-) -> tuple[float, float]:
+def objective_and_gap(b: Floats, c: Floats, q: Floats, half: Floats) -> tuple[float, float]:
     """Of weights b, where q = c - g b correlates columns and residual: [KKL07] III, nu = 2 theta (A b - y)."""
     bc, bq, penalty, theta = 0.0, 0.0, 0.0, 1.0
     for i in range(len(b)):
@@ -212,7 +165,7 @@ def _objective_and_gap(
             bc += b[i] * c[i]
             bq += b[i] * q[i]
             penalty += 2 * half[i] * abs(b[i])
-        steep = q[i] if non_negative else abs(q[i])
+        steep = abs(q[i])
         if steep > half[i]:
             theta = min(theta, half[i] / steep)
     residual = max(1 - bc - bq, 0.0)  # rounding may take it below 0
@@ -224,22 +177,22 @@ def _objective_and_gap(
 
 
 @numba.njit(parallel=True, cache=True)  # no fastmath: sums keep their order, on any number of threads
-def _all_by_descent(
+def _descend_all(
     G: NDArray,
     r: Floats,
     s: Floats,
     eps: float,
     relative_lambda: float,
     tolerance: float,
-    non_negative: bool,
+    most_steps: int,
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
     m, k = r.shape
     weights, objective, gap = np.zeros((m, k)), np.zeros(m), np.zeros(m)
     iterations = np.zeros(m, dtype=np.int64)
     for p in numba.prange(m):
-        used, g, c, half, unit = _normalised(G[p], r[p], s[p], eps, relative_lambda)
+        used, g, c, half, unit = normalise(G[p], r[p], s[p], eps, relative_lambda)
         b = np.zeros(len(used))
-        least, above, iterations[p] = _descend(g, c, half, b, relative_lambda > 0, non_negative, tolerance)
+        least, above, iterations[p] = _descend(g, c, half, b, relative_lambda > 0, tolerance, most_steps)
         objective[p], gap[p] = least * s[p], above * s[p]
         for a in range(len(used)):
             weights[p, used[a]] = b[a] * unit[a]
@@ -248,7 +201,7 @@ def _all_by_descent(
 
 @numba.njit(cache=True)
 def _descend(
-    g: Floats, c: Floats, half: Floats, b: Floats, penalised: bool, non_negative: bool, tolerance: float
+    g: Floats, c: Floats, half: Floats, b: Floats, penalised: bool, tolerance: float, most_steps: int
 ) -> tuple[float, float, int]:
     """Move b from 0 to the minimum; objective, gap, steps.
 
@@ -259,9 +212,9 @@ def _descend(
     order = np.empty(len(b), dtype=np.int64)  # unknowns that are not 0, as they came
     factor, target = np.empty_like(g), np.empty_like(b)
     active, factored, least = 0, 0, np.inf
-    for step in range(MAX_STEPS):
-        objective, gap = _objective_and_gap(b, c, q, half, non_negative)
-        steepest, slope = _steepest(b, q, half, non_negative)
+    for step in range(most_steps):
+        objective, gap = objective_and_gap(b, c, q, half)
+        steepest, slope = _steepest(b, q, half)
         if gap <= tolerance or objective >= least or (not penalised and slope <= tolerance):
             return objective, gap, step
         least = objective
@@ -275,25 +228,25 @@ def _descend(
         while active > 0 and not arrived:
             _factor(g, order, factored, active, factor)
             _face_minimum(c, half, b, order, active, factor, target)
-            active, factored, arrived = _move(b, target, order, active, penalised or non_negative)
+            active, factored, arrived = _move(b, target, order, active, penalised)
         _keep_bounded(b, half)
 
         q[:] = c
         for a in range(active):
             q -= b[order[a]] * g[order[a]]
-    objective, gap = _objective_and_gap(b, c, q, half, non_negative)
-    return objective, gap, MAX_STEPS
+    objective, gap = objective_and_gap(b, c, q, half)
+    return objective, gap, most_steps
 
 
 @numba.njit(cache=True)
-def _steepest(b: Floats, q: Floats, half: Floats, non_negative: bool) -> tuple[int, float]:
+def _steepest(b: Floats, q: Floats, half: Floats) -> tuple[int, float]:
     """The zero weight (or -1) along which the objective falls fastest, and half the largest slope of all weights."""
     steepest, fall, slope = -1, 0.0, 0.0
     for i in range(len(b)):
         if b[i] != 0:
             slope = max(slope, abs(q[i] - np.copysign(half[i], b[i])))
         else:
-            here = (q[i] if non_negative else abs(q[i])) - half[i]
+            here = abs(q[i]) - half[i]
             if here > fall:
                 steepest, fall = i, here
     return steepest, max(slope, fall)
@@ -302,16 +255,17 @@ def _steepest(b: Floats, q: Floats, half: Floats, non_negative: bool) -> tuple[i
 @numba.njit(cache=True)
 def _factor(g: Floats, order: NDArray[np.int64], first: int, last: int, factor: Floats) -> None:
     """Rows first to last of the Cholesky factor of g[order, order]; its diagonal is inverted."""
+    damping = 1e-14  # of a unit diagonal: columns equal but for rounding move together instead of far apart
     for a in range(first, last):
         for d in range(a):
             x = g[order[a], order[d]]
             for e in range(d):
                 x -= factor[a, e] * factor[d, e]
             factor[a, d] = x * factor[d, d]
-        x = g[order[a], order[a]] + DAMPING
+        x = g[order[a], order[a]] + damping
         for e in range(a):
             x -= factor[a, e] * factor[a, e]
-        factor[a, a] = 1 / np.sqrt(max(x, DAMPING))  # a pivot raised by rounding still makes a descent
+        factor[a, a] = 1 / np.sqrt(max(x, damping))  # a pivot raised by rounding still makes a descent
 
 
 @numba.njit(cache=True)
@@ -361,108 +315,12 @@ def _move(
 @numba.njit(cache=True)
 def _keep_bounded(b: Floats, half: Floats) -> None:
     """The penalty of a minimum is at most ||y||^2 = 1; only an indefinite matrix, no Gram matrix, leads beyond."""
+    longest = 2.0**26  # eps^(-1/2): smaller singular values than sqrt(eps) are lost in a Gram matrix
     penalty, length = 0.0, 0.0
     for i in range(len(b)):
         if b[i] != 0:
             penalty += 2 * half[i] * abs(b[i])
             length += abs(b[i])
-    excess = max(penalty, length / LONGEST)
+    excess = max(penalty, length / longest)
     if excess > 1:
         b /= excess
-
-
-# -- interior point ---------------------------------------------------------------------------------------------------
-
-
-def _all_by_interior_point(
-    G: NDArray, r: Floats, s: Floats, eps: float, relative_lambda: float, tolerance: float, _: bool
-) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
-    m, k = r.shape
-    weights, objective, gap = np.zeros((m, k)), np.zeros(m), np.zeros(m)
-    iterations = np.zeros(m, dtype=np.int64)
-    for p in range(m):
-        used, g, c, half, unit = _normalised(G[p], r[p], s[p], eps, relative_lambda)
-        b, iterations[p] = _interior_point(g, c, half, tolerance)
-        least, above = _objective_and_gap(b, c, c - g @ b, half, False)
-        objective[p], gap[p] = least * s[p], above * s[p]
-        weights[p, used] = b * unit
-    return weights, objective, gap, iterations
-
-
-def _interior_point(g: Floats, c: Floats, half: Floats, tolerance: float) -> tuple[Floats, int]:
-    """Log barrier of -u <= b <= u with Newton steps in (b, u) and t from the duality gap: [KKL07] IV.
-
-    Newton's method does not see the scale of unknowns; the start is b = 0 with its u on the central path.
-    """
-    b, n = np.zeros(len(c)), len(c)
-    gap = _objective_and_gap(b, c, c, half, False)[1]
-    if gap <= tolerance:
-        return b, 0
-    t = 2 * n / gap
-    u = 1 / (t * half)
-    for iteration in range(1, MAX_NEWTON_STEPS + 1):
-        step = _newton_step(g, c, half, b, u, t)
-        if step is None:
-            return b, iteration
-        b, u, length = step
-        gap = _objective_and_gap(b, c, c - g @ b, half, False)[1]
-        if gap <= tolerance:
-            return b, iteration
-        if length >= 0.5:
-            t = max(2 * min(2 * n / gap, t), t)
-    return b, MAX_NEWTON_STEPS
-
-
-def _newton_step(
-    g: Floats, c: Floats, half: Floats, b: Floats, u: Floats, t: float
-) -> tuple[Floats, Floats, float] | None:
-    """Next b, u and the length of the step to them; None where rounding lets the barrier fall no further."""
-    inside, squares = (u - b) * (u + b), u * u + b * b
-    slope_b, slope_u = 2 * t * (g @ b - c) + 2 * b / inside, 2 * t * half - 2 * u / inside
-    try:  # u is eliminated: of its block only 2 / (u^2 + b^2) is left on the diagonal
-        factor = scipy.linalg.cho_factor(2 * t * g + np.diag(2 / squares))
-    except scipy.linalg.LinAlgError:
-        return None
-    step_b = scipy.linalg.cho_solve(factor, -slope_b - 2 * u * b / squares * slope_u)
-    step_u = 2 * u * b / squares * step_b - slope_u * inside**2 / (2 * squares)
-
-    start = _barrier(g, c, half, b, u, t)
-    fall = slope_b @ step_b + slope_u @ step_u
-    length = 1.0
-    for _ in range(MAX_BACKTRACKS):
-        new_b, new_u = b + length * step_b, u + length * step_u
-        inner = bool((np.abs(new_b) < new_u).all())
-        if inner and _barrier(g, c, half, new_b, new_u, t) <= start + 0.01 * length * fall:
-            return new_b, new_u, length
-        length /= 2
-    return None
-
-
-def _barrier(g: Floats, c: Floats, half: Floats, b: Floats, u: Floats, t: float) -> float:
-    """The objective times t (less the constant 1, with u for |b|), and the logarithms."""
-    return float(t * (b @ (g @ b) - 2 * (b @ c) + 2 * (half @ u)) - np.log((u - b) * (u + b)).sum())
-
-
-# -- least squares ----------------------------------------------------------------------------------------------------
-
-
-def _by_eigenvectors(
-    G: Floats, r: Floats, s: Floats, relative_ridge: float, cut_off: float
-) -> tuple[Floats, Floats]:
-    """Weights and objectives of a block of problems."""
-    diagonal = np.einsum("mii->mi", G)  # [problem, unknown]
-    present = diagonal > 0
-    scale = np.abs(G).max(axis=(1, 2))
-    scale[scale == 0] = 1
-    G, r = G / scale[:, None, None], r / scale[:, None]
-    mean = (diagonal * present).sum(axis=1) / scale / np.maximum(present.sum(axis=1), 1)
-    ridge = relative_ridge * mean
-
-    values, vectors = np.linalg.eigh(G)  # [problem, eigenvalue], [problem, unknown, eigenvalue]
-    values = np.maximum(values, 0) + ridge[:, None]
-    kept = values > cut_off * values[:, -1:]
-    inverse = kept / np.where(kept, values, 1)
-    weights = np.einsum("mij,mj->mi", vectors, inverse * np.einsum("mij,mi->mj", vectors, r)) * present
-
-    square = np.einsum("mi,mi->m", weights, np.einsum("mij,mj->mi", G, weights) - 2 * r) * scale + s
-    return weights, np.maximum(square, 0) + ridge * scale * (weights**2).sum(axis=1)

@@ -38,7 +38,7 @@ def normal_equations(
     correlation = np.zeros((n, k))
     squared_norm = np.zeros(n)
     for i in numba.prange(n):
-        system, y = _gathered(rows, neighbours[i], directions[i], values[i])
+        system, y = _gather(rows, neighbours[i], directions[i], values[i])
         gram[i] = system.T @ system
         correlation[i] = system.T @ y
         squared_norm[i] = y @ y
@@ -46,7 +46,7 @@ def normal_equations(
 
 
 @numba.njit(cache=True)
-def _gathered(
+def _gather(
     rows: NDArray[np.float32],
     neighbours: NDArray[np.int32],
     directions: NDArray[np.int32],

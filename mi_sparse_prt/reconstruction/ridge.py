@@ -14,10 +14,24 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-DEVIATIONS = (0.005, 0.01, 0.02, 0.04)  # of weights, tried beside 0
-SURE = 3  # standard errors that the saving must be above 0
-LEAST_RIDGE = 1e-3  # of the trace of a Gram matrix
-LEAST_GAIN = 0.05  # of the squared error that samples must save, or they are not worth their paths
+
+@dataclass(frozen=True)
+class RidgeOptions:
+    """When samples correct weights.
+
+    Attributes
+    ----------
+    deviations : tuple of float
+        Of weights from the prior ones, tried beside 0.
+    confidence : float
+        Standard errors that the saving must be above 0.
+    minimum_gain : float
+        Of the squared error that samples must save, or they are not worth their paths.
+    """
+
+    deviations: tuple[float, ...] = (0.005, 0.01, 0.02, 0.04)
+    confidence: float = 3
+    minimum_gain: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,16 +59,16 @@ class System:
         return System(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
-def about(
+def shift_to_prior(
     prior: Floats, gram: Floats, correlation: Floats, squared_norm: Floats, count: NDArray[np.int64]
 ) -> System:
-    """The system of `reconstruction.systems.normal_equations`, moved to the prior weights (n, k)."""
+    """The system of `reconstruction.normal_equations`, moved to the prior weights (n, k)."""
     product = np.einsum("nij,nj->ni", gram, prior)
     square = squared_norm - 2 * (prior * correlation).sum(axis=1) + (prior * product).sum(axis=1)
     return System(gram, correlation - product, square, count)
 
 
-def correction(system: System, noise: Floats, deviation: float) -> Floats:
+def fit_correction(system: System, noise: Floats, deviation: float) -> Floats:
     """What to add to the prior weights, (n, k).
 
     Parameters
@@ -65,15 +79,18 @@ def correction(system: System, noise: Floats, deviation: float) -> Floats:
     deviation : float
         tau, positive.
     """
+    least_ridge = 1e-3  # of the trace of a Gram matrix
     k = system.gram.shape[1]
     largest = np.einsum("nii->n", system.gram)
     # keeps weights bounded where samples have no noise; dark ones decide nothing
-    ridge = np.maximum(noise / deviation**2, np.where(largest > 0, LEAST_RIDGE * largest, 1.0))
+    ridge = np.maximum(noise / deviation**2, np.where(largest > 0, least_ridge * largest, 1.0))
     damped = system.gram + ridge[:, None, None] * np.eye(k)
     return np.asarray(np.linalg.solve(damped, system.slope[..., None])[..., 0])
 
 
-def best_deviation(halves: tuple[System, System], noise: Floats) -> float:
+def choose_deviation(
+    halves: tuple[System, System], noise: Floats, options: RidgeOptions | None = None
+) -> float:
     """The tau whose correction from one half of the samples fits the other half best; 0 if none is worth it.
 
     Parameters
@@ -82,18 +99,21 @@ def best_deviation(halves: tuple[System, System], noise: Floats) -> float:
         Independent samples of the same vertices.
     noise : (n,) float64
         Variance of each sample.
+    options : RidgeOptions, optional
     """
+    options = options or RidgeOptions()
     error = sum(float((half.square - half.count * noise).sum()) for half in halves)
-    best, most = 0.0, LEAST_GAIN * max(error, 0.0)
-    for deviation in DEVIATIONS:
-        saved = _saved(*halves, noise, deviation) + _saved(*halves[::-1], noise, deviation)
-        if saved.sum() > max(most, SURE * np.linalg.norm(saved)):  # the sum's standard error, were its mean 0
+    best, most = 0.0, options.minimum_gain * max(error, 0.0)
+    for deviation in options.deviations:
+        saved = _saving(*halves, noise, deviation) + _saving(*halves[::-1], noise, deviation)
+        error_of_sum = np.linalg.norm(saved)  # its standard error, were its mean 0
+        if saved.sum() > max(most, options.confidence * error_of_sum):
             best, most = deviation, float(saved.sum())
     return best
 
 
-def _saved(one: System, other: System, noise: Floats, deviation: float) -> Floats:
+def _saving(one: System, other: System, noise: Floats, deviation: float) -> Floats:
     """By how much the correction from one half lowers the square of the other, (n,)."""
-    a = correction(one, noise, deviation)
+    a = fit_correction(one, noise, deviation)
     product = np.einsum("nij,nj->ni", other.gram, a)
     return np.asarray((2 * a * other.slope - a * product).sum(axis=1))

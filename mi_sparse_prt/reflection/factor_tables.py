@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
 
-SIZE = 128  # of a table
-HORIZON = 1e-3  # cosine at which values beyond the horizon are taken
+SIZE = 128  # of a table, unless something else is asked for
 
 Floats = NDArray[np.float32]
 
 
 def table_directions(size: int = SIZE) -> Floats:
     """Directions (size * size, 3) of a table's entries, those beyond the horizon moved to it."""
+    horizon = 1e-3  # cosine at which values beyond the horizon are taken
     axis = np.linspace(-1, 1, size)
     x, y = (a.ravel() for a in np.meshgrid(axis, axis, indexing="xy"))
     r = np.hypot(x, y)
-    inside = np.minimum(r, np.sqrt((1 - HORIZON) / (1 + HORIZON)))  # z = (1 - r^2) / (1 + r^2)
+    inside = np.minimum(r, np.sqrt((1 - horizon) / (1 + horizon)))  # z = (1 - r^2) / (1 + r^2)
     x, y = (a * inside / np.maximum(r, 1e-9) for a in (x, y))
     square = inside**2
     return (np.stack([2 * x, 2 * y, 1 - square], axis=1) / (1 + square)[:, None]).astype(np.float32)
@@ -35,7 +35,7 @@ def table_directions(size: int = SIZE) -> Floats:
 def incident_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Floats:
     """f_k of some materials, (materials, size, size, K); zeros where one has fewer terms."""
     every = table_directions(size)
-    return _stacked([m.grid.interpolated(m.incident, every).T.reshape(size, size, -1) for m in materials])
+    return _stack([m.grid.interpolate(m.incident, every).T.reshape(size, size, -1) for m in materials])
 
 
 def outgoing_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Floats:
@@ -43,12 +43,12 @@ def outgoing_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Float
     every = table_directions(size)
     found = []
     for m in materials:
-        values = np.moveaxis(m.grid.interpolated(m.outgoing, every), 2, 0)  # [direction, term, channel]
+        values = np.moveaxis(m.grid.interpolate(m.outgoing, every), 2, 0)  # [direction, term, channel]
         found.append(np.broadcast_to(values, (*values.shape[:2], 3)).reshape(size, size, -1, 3))
-    return _stacked(found)
+    return _stack(found)
 
 
-def looked_up(
+def look_up(
     table: mi.Float, size: int, terms: int, material: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
 ) -> list[mi.Float]:
     """Values (terms) of tables (materials, size, size, terms), flattened, in directions of their frames; bilinear."""
@@ -72,7 +72,7 @@ def looked_up(
     return found
 
 
-def _stacked(tables: list[NDArray[np.floating]]) -> Floats:
+def _stack(tables: list[NDArray[np.floating]]) -> Floats:
     terms = max(table.shape[2] for table in tables)
     result = np.zeros((len(tables), *tables[0].shape[:2], terms, *tables[0].shape[3:]), np.float32)
     for table, place in zip(tables, result, strict=True):

@@ -44,7 +44,7 @@ def vertex_tangents(scene: Scene) -> Floats:
         _mean_axes(shape, mesh, scene.normals[mesh.vertices].astype(np.float64))
         for shape, mesh in zip(scene.mitsuba.shapes(), scene.meshes, strict=True)
     ]
-    return orthogonal(np.concatenate(found).astype(np.float32), scene.normals)
+    return orthogonalise(np.concatenate(found).astype(np.float32), scene.normals)
 
 
 def triangle_tangents(shape: mi.Mesh, triangles: NDArray[np.integer]) -> Doubles:
@@ -95,7 +95,7 @@ def _unit(vectors: Doubles) -> Doubles:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
-def orthogonal(along: Floats, normals: Floats) -> Floats:
+def orthogonalise(along: Floats, normals: Floats) -> Floats:
     """Vectors (n, 3) turned into the planes of normals (n, 3), of length 1; any tangent where they cannot be."""
     flat = along - normals * np.einsum("nd,nd->n", along, normals)[:, None]
     length = np.linalg.norm(flat, axis=1, keepdims=True)

@@ -106,7 +106,7 @@ class InOutFactors(Reflection):
         for number, factors in enumerate(self.factors):
             own = np.flatnonzero(self.material == number)
             local = np.einsum("nij,nj->ni", turn[own], outgoing[own])
-            g = factors.grid.interpolated(factors.outgoing, local)  # [term, channel, vertex]
+            g = factors.grid.interpolate(factors.outgoing, local)  # [term, channel, vertex]
             lobes = np.broadcast_to(g, (len(g), 3, len(own)))
             radiance[own] += np.einsum("kcn,nkc->nc", lobes, terms[own][:, : len(g)])
         above = np.einsum("nd,nd->n", outgoing, self.normals) > 0

@@ -11,10 +11,10 @@ import numpy as np
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.reflection.brdf_factors import (
     BrdfFactors,
-    anisotropic,
     diffuse_reflectance,
     factors_of,
     harmonic_factors,
+    is_anisotropic,
 )
 from mi_sparse_prt.reflection.frames import beside_vertices, vertex_tangents
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -52,7 +52,7 @@ def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None
     for mesh, own, shape in zip(scene.meshes, scene.materials, scene.mitsuba.shapes(), strict=True):
         if own.diffuse:
             continue
-        if not shape.has_vertex_texcoords() and anisotropic(own.bsdf, mesh.name):
+        if not shape.has_vertex_texcoords() and is_anisotropic(own.bsdf, mesh.name):
             warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=3)
         digest = own.digest()
         if digest not in known:

@@ -24,9 +24,11 @@ class VaryingDiffuse(mi.Texture):
         self._bsdf = bsdf
         origin = dr.zeros(mi.SurfaceInteraction3f)
         known = diffuse_reflectance(bsdf, "factored", origin)[0]
-        self._offset = mi.ScalarColor3f(*map(float, known - np.ravel(self._slanted(origin, mi.Bool(True)))))
+        self._offset = mi.ScalarColor3f(
+            *map(float, known - np.ravel(self._evaluate_slanted(origin, mi.Bool(True))))
+        )
 
-    def _slanted(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+    def _evaluate_slanted(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """The BRDF times pi, away from the highlight."""
         back = mi.Vector3f(*SLANTED)
         here = mi.SurfaceInteraction3f(si)
@@ -34,7 +36,7 @@ class VaryingDiffuse(mi.Texture):
         return self._bsdf.eval(mi.BSDFContext(), here, back, active) * (dr.pi / SLANTED[2])
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
-        return dr.maximum(self._slanted(si, active) + self._offset, 0)
+        return dr.maximum(self._evaluate_slanted(si, active) + self._offset, 0)
 
     def is_spatially_varying(self) -> bool:
         return True

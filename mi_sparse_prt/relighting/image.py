@@ -13,10 +13,11 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
-from mi_sparse_prt.reflection.factor_tables import looked_up, outgoing_tables
+from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.shape_table import first_triangles
 from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
@@ -49,7 +50,7 @@ class RelitScene:
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
-        self._first_triangle = _by_shape([len(mesh.triangles) for mesh in scene.meshes], self._scene)
+        self._first_triangle = first_triangles(self._scene)
 
     def radiance(self, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
@@ -63,8 +64,7 @@ class RelitScene:
         return value, valid
 
     def _hit_corners(self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask) -> list[Corner]:
-        first = dr.gather(mi.UInt32, self._first_triangle, dr.reinterpret_array(mi.UInt32, hit.shape), valid)
-        triangle = first + hit.prim_index
+        triangle = self._first_triangle.gather(hit.shape, valid) + hit.prim_index
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
         return list(zip(vertices, (1 - u - v, u, v), strict=True))
@@ -148,9 +148,7 @@ class GlossyRelitScene(RelitScene):
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
             s = dr.normalize(tangent - si.sh_frame.n * dr.dot(si.sh_frame.n, tangent))
             local = mi.Frame3f(s, dr.cross(si.sh_frame.n, s), si.sh_frame.n).to_local(towards)
-            lobes = [
-                looked_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables
-            ]
+            lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
             for k, values in enumerate(self._terms):
                 coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
                 total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)
@@ -259,11 +257,3 @@ def background_emitter(
         )
     texels, n = lighting.project(environment), lighting.resolution
     return mi.load_dict({"type": "cubemap", "data": mi.TensorXf(texels.reshape(6, n, n, 3)), "resolution": n})
-
-
-def _by_shape(counts: list[int], scene: mi.Scene) -> mi.UInt32:
-    """First triangle of every shape among all, indexed by the number that Dr.Jit knows the shape by."""
-    numbers = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
-    first = np.zeros(int(numbers.max()) + 1, dtype=np.uint32)
-    first[numbers] = np.cumsum([0, *counts[:-1]])
-    return mi.UInt32(first)

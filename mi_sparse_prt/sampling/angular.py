@@ -15,10 +15,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, listed, lowest, pack, scattered
+from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, list_bits, lowest_bit, pack, scatter_bits
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
-
-RADIUS = 3  # texels: windows of 7 x 7
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,8 @@ class AngularGrid:
     Parameters
     ----------
     lighting : CubemapLighting
+    radius : int
+        Of the windows, in texels; 3 are the 7 x 7 of [HR10] Figure 3.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class AngularGrid:
         Every second texel per axis, n_directions / 4 of them (all at resolution 1).
     """
 
-    def __init__(self, lighting: CubemapLighting) -> None:
-        self.lighting = lighting
+    def __init__(self, lighting: CubemapLighting, radius: int = 3) -> None:
+        self.lighting, self._radius = lighting, radius
         n = lighting.resolution
         self._face, self._row, self._column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
         self._sampled = (self._row % 2 == 0) & (self._column % 2 == 0)
@@ -79,10 +79,10 @@ class AngularGrid:
         """
         above = above_horizon(normals, self.lighting.directions)
         first = above & pack(self._sampled)
-        seen = scattered(first, visible(*listed(first)))
+        seen = scatter_bits(first, visible(*list_bits(first)))
         features, borrowed = np.empty_like(first), np.empty_like(first)
         _second_pass(first, seen, above, *self._stamps, features, borrowed)
-        seen |= borrowed | scattered(features, visible(*listed(features)))
+        seen |= borrowed | scatter_bits(features, visible(*list_bits(features)))
         return DenseRows(seen, first | features, features, above)
 
     @cached_property
@@ -92,9 +92,10 @@ class AngularGrid:
         Windows continue across the edges of the cube on the plane of the texel's own face.
         """
         columns = []
-        for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
-                texels, inside = self._shifted(dx, dy)
+        steps = range(-self._radius, self._radius + 1)
+        for dy in steps:
+            for dx in steps:
+                texels, inside = self._shift(dx, dy)
                 columns.append(np.where(self._sampled[texels] & inside, texels, -1))
         table = np.sort(np.stack(columns, axis=1), axis=1)[:, ::-1]  # [texel, place], -1 last
         table[:, 1:][table[:, 1:] == table[:, :-1]] = -1  # beyond an edge two places can meet one texel
@@ -130,7 +131,7 @@ class AngularGrid:
         rows, columns, weights = [], [], []
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                texels, inside = self._shifted(dx, dy)
+                texels, inside = self._shift(dx, dy)
                 # a sampled texel keeps its own value
                 wanted = ~self._sampled if dx or dy else np.ones_like(self._sampled)
                 good = np.flatnonzero(self._sampled[texels] & inside & wanted)
@@ -142,7 +143,7 @@ class AngularGrid:
         total = matrix.sum(axis=1)
         return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / total) @ matrix, dtype=np.float32)
 
-    def _shifted(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _shift(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """The texel (dx, dy) beside each texel, and whether it is not beyond two edges at once."""
         n = self.lighting.resolution
         column, row = self._column + dx, self._row + dy
@@ -178,7 +179,7 @@ def _second_pass(
         for w in range(words):
             left = first[i, w]
             while left:
-                bit = np.uint32(lowest(left))  # type: ignore[call-arg]  # numba gives the context
+                bit = np.uint32(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
                 left &= left - np.uint32(1)
                 kind = (seen[i, w] >> bit) & np.uint32(1)
                 texel = w * BITS + np.int64(bit)

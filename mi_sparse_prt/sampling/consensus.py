@@ -12,20 +12,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import above_horizon, listed, overwrite
-from mi_sparse_prt.core.morton import along_curve
-from mi_sparse_prt.measurement.neighbours import renumbered, surface_neighbours
+from mi_sparse_prt.core.bits import above_horizon, list_bits, overwrite_bits
+from mi_sparse_prt.core.morton import morton_order
+from mi_sparse_prt.measurement.neighbours import renumber, surface_neighbours
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.features import contested, copy_agreed
-
-STRIDES = (12, 4, 2, 1)  # one vertex in so many is known after each level; each divides the one before
-NEIGHBOURS = 8  # that are asked
-LEAST_NEIGHBOURS = 3  # with fewer on its own surface, a vertex is sampled as those of the first level
-AROUND = 8  # of all vertices, for repair
-BLOCK = 1 << 14  # vertices at a time, some hundred rays each
+from mi_sparse_prt.sampling.features import copy_agreed, find_contested
 
 Ids = NDArray[np.int64]
 Trace = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class ConsensusOptions:
+    """How vertices become known.
+
+    Attributes
+    ----------
+    strides : tuple of int
+        One vertex in so many is known after each level; each divides the one before, and the last is 1. [HR10] 4.1 has
+        two levels, dense and sparse vertices.
+    neighbours : int
+        Known vertices that are asked. On a bumpy sphere, of whose vertices a quarter were known in a single level, 8
+        left 11.6% of all elements to be traced, at an error of 4.9%; 12 left 12.6%, at 3.7%.
+    least_neighbours : int
+        With fewer on its own surface, a vertex is sampled as those of the first level.
+    repair_neighbours : int
+        Of all vertices, asked again at the end.
+    block : int
+        Vertices at a time, some hundred rays each.
+    """
+
+    strides: tuple[int, ...] = (12, 4, 2, 1)
+    neighbours: int = 8
+    least_neighbours: int = 3
+    repair_neighbours: int = 8
+    block: int = 1 << 14
 
 
 class Consensus:
@@ -38,6 +59,7 @@ class Consensus:
     grid : AngularGrid
     trace : callable
         ``trace(vertices, texels)``, both (m,) uint32: whether vertices see the centres of texels, (m,) bool.
+    options : ConsensusOptions
 
     Attributes
     ----------
@@ -45,15 +67,22 @@ class Consensus:
         As in ``DenseRows``.
     """
 
-    def __init__(self, normals: NDArray[np.float32], grid: AngularGrid, trace: Trace) -> None:
+    def __init__(
+        self,
+        normals: NDArray[np.float32],
+        grid: AngularGrid,
+        trace: Trace,
+        options: ConsensusOptions | None = None,
+    ) -> None:
         self._grid, self._trace, self._normals = grid, trace, normals
+        self.options = options or ConsensusOptions()
         self.above = above_horizon(normals, grid.lighting.directions)
         self.visible, self.evaluated = np.zeros_like(self.above), np.zeros_like(self.above)
 
     def sample(self, vertices: Ids) -> None:
         """Sample rows adaptively in angle."""
-        names = vertices.astype(np.uint32)
-        rows = self._grid.sample(self._normals[vertices], lambda r, t: self._trace(names[r], t))
+        ids = vertices.astype(np.uint32)
+        rows = self._grid.sample(self._normals[vertices], lambda r, t: self._trace(ids[r], t))
         self.visible[vertices], self.evaluated[vertices] = rows.visible, rows.evaluated
 
     def agree(self, vertices: Ids, near: NDArray[np.int32]) -> None:
@@ -69,12 +98,13 @@ class Consensus:
 
         All are compared before any is changed: the order of vertices and the size of blocks do not matter.
         """
-        asked = contested(near, self.visible, self.above, vertices, self.above, self.evaluated)
-        for a in range(0, len(vertices), BLOCK):
-            some, bits = vertices[a : a + BLOCK], asked[a : a + BLOCK]
-            rows, texels = listed(bits)
+        asked = find_contested(near, self.visible, self.above, vertices, self.above, self.evaluated)
+        block = self.options.block
+        for a in range(0, len(vertices), block):
+            some, bits = vertices[a : a + block], asked[a : a + block]
+            rows, texels = list_bits(bits)
             values = self._trace(some.astype(np.uint32)[rows], texels)
-            overwrite(self.visible, self.evaluated, some, bits, values)
+            overwrite_bits(self.visible, self.evaluated, some, bits, values)
 
 
 @dataclass(frozen=True)
@@ -87,7 +117,7 @@ class Surface:
         Of its vertices, which follow each other.
     positions, normals : (n, 3) float
     keys : (n,) uint64
-        Names of the vertices.
+        Of the vertices (``Points.keys``).
     """
 
     first: int
@@ -95,16 +125,19 @@ class Surface:
     normals: NDArray[np.floating]
     keys: NDArray[np.uint64]
 
-    def levels(self) -> list[Ids]:
-        """Its vertices (counted from 0) in levels, each spread evenly; independent of the order in which they come."""
-        order = along_curve(self.positions, self.keys)
-        level = np.full(len(order), len(STRIDES) - 1)
-        for number, stride in reversed(list(enumerate(STRIDES))):
+    def levels(self, strides: tuple[int, ...]) -> list[Ids]:
+        """Its vertices (counted from 0) in levels, each spread evenly; independent of the order in which they come.
+
+        After each level, one vertex in as many as its stride is in this level or one before.
+        """
+        order = morton_order(self.positions, self.keys)
+        level = np.full(len(order), len(strides) - 1)
+        for number, stride in reversed(list(enumerate(strides))):
             level[::stride] = number
-        return [order[level == number] for number in range(len(STRIDES))]
+        return [order[level == number] for number in range(len(strides))]
 
 
-def by_levels(state: Consensus, surface: Surface) -> None:
+def sample_by_levels(state: Consensus, surface: Surface) -> None:
     """Make the rows of a mesh known, level by level, and repair them.
 
     Parameters
@@ -112,15 +145,18 @@ def by_levels(state: Consensus, surface: Surface) -> None:
     state : Consensus
     surface : Surface
     """
-    levels = surface.levels()
+    options = state.options
+    levels = surface.levels(options.strides)
     known = levels[0]
     state.sample(surface.first + known)
     p, n = surface.positions, surface.normals
     for new in levels[1:]:
-        near = surface_neighbours(p[new], n[new], p[known], n[known], NEIGHBOURS).ids
-        lonely = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
+        near = surface_neighbours(p[new], n[new], p[known], n[known], options.neighbours).ids
+        lonely = (near >= 0).sum(axis=1) < options.least_neighbours
         state.sample(surface.first + new[lonely])
-        state.agree(surface.first + new[~lonely], renumbered(near[~lonely], surface.first + known))
+        state.agree(surface.first + new[~lonely], renumber(near[~lonely], surface.first + known))
         known = np.concatenate([known, new])
-    around = surface_neighbours(p[known], n[known], p, n, AROUND + 1).ids[:, 1:]  # without itself
-    state.repair(surface.first + known, renumbered(around, surface.first + np.arange(len(p))))
+    around = surface_neighbours(p[known], n[known], p, n, options.repair_neighbours + 1).ids[
+        :, 1:
+    ]  # without itself
+    state.repair(surface.first + known, renumber(around, surface.first + np.arange(len(p))))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import Bits
 
 
-def contested(
+def find_contested(
     neighbours: NDArray[np.int32],
     visible: Bits,
     known: Bits,
@@ -39,12 +39,12 @@ def contested(
         Above the vertex's own horizon, and not sampled before.
     """
     differ = np.empty((len(vertices), above.shape[1]), np.uint32)
-    _contested(neighbours, visible, known, vertices, above, evaluated, differ)
+    _find_contested(neighbours, visible, known, vertices, above, evaluated, differ)
     return differ
 
 
 @numba.njit(parallel=True, cache=True)
-def _contested(
+def _find_contested(
     neighbours: NDArray[np.int32],
     visible: Bits,
     known: Bits,
@@ -69,7 +69,7 @@ def copy_agreed(
     above: Bits,
     result: Bits,
 ) -> None:
-    """Give vertices the visibility on which their neighbours agree; parameters as for ``contested``.
+    """Give vertices the visibility on which their neighbours agree; parameters as for ``find_contested``.
 
     ``result`` (n_v, words): rows of the vertices are overwritten, with 0 where neighbours differ or know nothing.
     """
@@ -96,7 +96,7 @@ def _kinds(neighbours: NDArray[np.int32], visible: Bits, known: Bits) -> tuple[B
 
 
 @numba.njit(parallel=True, cache=True)
-def best_features(
+def choose_features(
     neighbours: NDArray[np.int32], rows: NDArray[np.float32], features: Bits, count: int
 ) -> NDArray[np.int32]:
     """The paper's choice: variance among the dense neighbours x number of them in which a direction was a feature.

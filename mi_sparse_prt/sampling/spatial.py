@@ -10,16 +10,47 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import ones
+from mi_sparse_prt.core.bits import count_ones
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.measurement.neighbours import finite_rows, radius_neighbours
+from mi_sparse_prt.measurement.neighbours import check_finite_rows, radius_neighbours
 
-ENERGY = 0.99  # of a local matrix (sum of squared singular values) that its rank accounts for
-RADIUS = 0.1  # of a local matrix, in longest sides of the mesh's box
-ROUNDING = 1e-9  # of the energy: 99 of 100 equal singular values hold 0.99, whatever their last bits
-LEAST_DENSE = 2  # vertices of a mesh
-SHARING = 8  # one in so many of the first iteration's vertices is the centre of a local matrix
+
+@dataclass(frozen=True)
+class SpatialSampling:
+    """How many vertices become dense, and by what ([HR10] 4.1).
+
+    Attributes
+    ----------
+    fraction : float
+        Of the vertices, in (0, 1]; at least two vertices are chosen, if the mesh has so many.
+    step : float
+        Of the vertices, in (0, 1], that one iteration adds; the last one may be smaller.
+    radius : float, optional
+        Of a local matrix; a tenth of the longest side of the mesh's box if not given.
+    rows : int
+        Of a local matrix, at most.
+    energy : float
+        Of a local matrix (sum of squared singular values) that its rank accounts for.
+    power : float
+        Vertices are drawn in proportion to their ranks to this power.
+    sharing : int
+        One in so many of the first iteration's vertices is the centre of a local matrix, whose rank is that of all
+        vertices to which it is the nearest.
+    """
+
+    fraction: float
+    step: float = 0.05
+    radius: float | None = None
+    rows: int = 30
+    energy: float = 0.99
+    power: float = 1.0
+    sharing: int = 8
+
+    def __post_init__(self) -> None:
+        for name, value in (("fraction", self.fraction), ("step", self.step)):
+            if not 0 < value <= 1:
+                raise PrtError(f"{name} is {value}: give a share of the vertices in (0, 1]")
 
 
 @dataclass(frozen=True)
@@ -48,40 +79,24 @@ def choose_dense(
     positions: NDArray[np.floating],
     keys: NDArray[np.uint64],
     visibility: Callable[[NDArray[np.int64]], NDArray[np.uint32]],
-    fraction: float,
-    step: float = 0.05,
-    radius: float | None = None,
-    k: int = 30,
-    power: float = 1.0,
+    sampling: SpatialSampling,
     seed: int = 0,
-    stop: Callable[[SpatialSamples], bool] | None = None,
 ) -> SpatialSamples:
     """Choose the dense vertices of one mesh in iterations, by the local rank of what is known so far ([HR10] 4.1).
 
-    The first iteration takes `step` of the vertices at random; one in eight of them is the centre of a local matrix.
-    Each later one computes the ranks of these and draws `step` more by rank, until there are `fraction` of them.
+    The first iteration takes a step's share of the vertices at random; one in eight of them is the centre of a local
+    matrix. Each later one computes the ranks of these and draws as many more by rank, until there are enough.
 
     Parameters
     ----------
     positions : (n, 3) float, any frame
     keys : (n,) uint64
-        Names of the vertices (``Points.keys``), from which random numbers are made.
+        Of the vertices (``Points.keys``); random numbers are made of them.
     visibility : callable
         Vertex ids (n_i,) to packed visibility rows (n_i, words) uint32: bit ``j % 32`` of word ``j // 32``. Called once
         per iteration, with the vertices that are new.
-    fraction : float
-        Of the vertices, in (0, 1]; at least two vertices are chosen, if the mesh has so many.
-    step : float
-        Of the vertices, in (0, 1]; the last iteration may be smaller.
-    radius : float, optional
-        Of a local matrix; a tenth of the longest side of the mesh's box if not given.
-    k : int
-        Rows of a local matrix, at most.
-    power : float
-        Vertices are drawn in proportion to their ranks to this power.
+    sampling : SpatialSampling
     seed : int
-    stop : callable, optional
-        Asked after each iteration with what was chosen so far; True ends the choice early.
 
     Returns
     -------
@@ -91,18 +106,16 @@ def choose_dense(
     Raises
     ------
     PrtError
-        If `fraction` or `step` is not in (0, 1], or a position is not finite.
+        If a position is not finite.
     """
-    for name, value in (("fraction", fraction), ("step", step)):
-        if not 0 < value <= 1:
-            raise PrtError(f"{name} is {value}: give a share of the vertices in (0, 1]")
     n = len(positions)
     # all below is in the order of keys: ties of every kind then fall the same way in whatever order vertices come
     by_key = np.argsort(keys, kind="stable")
-    p, names = finite_rows(positions, "vertex", "position")[by_key], np.asarray(keys)[by_key]
+    p, sorted_keys = check_finite_rows(positions, "vertex", "position")[by_key], np.asarray(keys)[by_key]
+    radius = sampling.radius
     if radius is None:
-        radius = RADIUS * float(np.ptp(p, axis=0).max()) if n else 0.0
-    total = _share(fraction, n)
+        radius = 0.1 * float(np.ptp(p, axis=0).max()) if n else 0.0
+    total = _share(sampling.fraction, n)
     ranks = np.zeros(n, np.float32)
     free = np.ones(n, dtype=bool)
     dense: list[NDArray[np.int64]] = []  # [iteration][vertex], in the order of keys
@@ -111,18 +124,19 @@ def choose_dense(
     while True:
         start = time.perf_counter()
         if len(dense) == 1:  # shared matrices: a vertex takes the rank around the nearest of the first ones
-            centres = p[dense[0][::SHARING]]
+            centres = p[dense[0][:: sampling.sharing]]
             owner = radius_neighbours(p, centres, np.inf, 1).ids[:, 0]
         if len(dense):
             known, chosen = np.concatenate(bits), np.concatenate(dense)
-            ranks = local_ranks_at(centres, known, p[chosen], radius, k)[owner].astype(np.float32)
+            found = local_ranks_at(centres, known, p[chosen], radius, sampling.rows, sampling.energy)
+            ranks = found[owner].astype(np.float32)
         seconds["rank"] += time.perf_counter() - start
 
         start = time.perf_counter()
         left = np.flatnonzero(free)
-        wanted = min(_share(step, n), total - (n - len(left)))
-        weights = ranks[left] ** power if len(dense) else np.ones(len(left), np.float32)
-        new = left[weighted_choice(weights, names[left], wanted, _nth_seed(seed, len(dense)))]
+        wanted = min(_share(sampling.step, n), total - (n - len(left)))
+        weights = ranks[left] ** sampling.power if len(dense) else np.ones(len(left), np.float32)
+        new = left[choose_weighted(weights, sorted_keys[left], wanted, _nth_seed(seed, len(dense)))]
         free[new] = False
         dense.append(new)
         seconds["choice"] += time.perf_counter() - start
@@ -134,11 +148,11 @@ def choose_dense(
         by_vertex[by_key] = ranks
         iterations = [np.sort(by_key[ids]) for ids in dense]
         samples = SpatialSamples(np.sort(by_key[~free]), by_vertex, iterations, dict(seconds))
-        if len(samples.ids) >= total or (stop is not None and stop(samples)):
+        if len(samples.ids) >= total:
             return samples
 
 
-def weighted_choice(
+def choose_weighted(
     weights: NDArray[np.floating], keys: NDArray[np.uint64], count: int, seed: int
 ) -> NDArray[np.int64]:
     """Draw without replacement, each draw in proportion to the weights of what is left (Efraimidis and Spirakis 2006).
@@ -184,6 +198,7 @@ def local_ranks_at(
     dense_positions: NDArray[np.floating],
     radius: float,
     k: int,
+    energy: float = 0.99,
 ) -> NDArray[np.int64]:
     """Local rank around some places: that of the up to k nearest dense rows within the radius ([HR10] 4.1).
 
@@ -195,6 +210,8 @@ def local_ranks_at(
     dense_positions : (n_dense, 3) float, same frame
     radius : float
     k : int
+    energy : float
+        Of a local matrix that its rank accounts for.
 
     Returns
     -------
@@ -207,10 +224,12 @@ def local_ranks_at(
     """
     if len(bits) != len(dense_positions):
         raise PrtError(f"{len(dense_positions)} dense vertices have {len(bits)} rows of bits: give one each")
-    return local_rank(bits, radius_neighbours(centres, dense_positions, radius, k).ids)
+    return local_rank(bits, radius_neighbours(centres, dense_positions, radius, k).ids, energy)
 
 
-def local_rank(bits: NDArray[np.uint32], neighbours_ids: NDArray[np.integer]) -> NDArray[np.int64]:
+def local_rank(
+    bits: NDArray[np.uint32], neighbours_ids: NDArray[np.integer], energy: float = 0.99
+) -> NDArray[np.int64]:
     """Rank of local light transport matrices: how many singular values hold 99% of their energy ([HR10] 4.1).
 
     A matrix has the visibility rows, entries 0 and 1, of some dense vertices: neither the cosine nor the noise of
@@ -223,6 +242,8 @@ def local_rank(bits: NDArray[np.uint32], neighbours_ids: NDArray[np.integer]) ->
         Bit ``j % 32`` of word ``j // 32``.
     neighbours_ids : (m, k) int
         Rows of each matrix; -1 where there are fewer.
+    energy : float
+        The share of the energy.
 
     Returns
     -------
@@ -238,17 +259,18 @@ def local_rank(bits: NDArray[np.uint32], neighbours_ids: NDArray[np.integer]) ->
         return np.zeros(len(ids), np.int64)
     odd = bits.shape[1] % 2
     words = np.ascontiguousarray(np.pad(bits, ((0, 0), (0, odd))) if odd else bits, np.uint32)
-    return _ranks(words.view(np.uint64), ids)
+    rounding = 1e-9  # 99 of 100 equal singular values hold 0.99, whatever their last bits
+    return _ranks(words.view(np.uint64), ids, energy - rounding)
 
 
 @numba.njit(parallel=True, cache=True)
-def _ranks(words: NDArray[np.uint64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+def _ranks(words: NDArray[np.uint64], ids: NDArray[np.int64], energy: float) -> NDArray[np.int64]:
     """Ranks (m,) of the matrices with rows `ids` (m, k) of `words` (n_dense, w), one matrix per thread at a time."""
     ranks = np.zeros(len(ids), np.int64)
     for v in numba.prange(len(ids)):
         rows = ids[v][ids[v] >= 0]
         if len(rows):
-            ranks[v] = _count_largest(np.linalg.eigvalsh(_gram(words, rows)))
+            ranks[v] = _count_largest(np.linalg.eigvalsh(_gram(words, rows)), energy)
     return ranks
 
 
@@ -263,15 +285,15 @@ def _gram(words: NDArray[np.uint64], rows: NDArray[np.int64]) -> NDArray[np.floa
             b = words[rows[j]]
             shared = np.uint64(0)
             for w in range(len(a)):
-                shared += ones(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
+                shared += count_ones(a[w] & b[w])  # type: ignore[call-arg]  # numba gives the context
             gram[i, j] = gram[j, i] = shared
     return gram
 
 
 @numba.njit(cache=True)
-def _count_largest(ascending: NDArray[np.floating]) -> int:
-    """How many of the largest values hold `ENERGY` of their sum; 0 if they are all 0."""
-    missing = ascending.sum() * (ENERGY - ROUNDING)
+def _count_largest(ascending: NDArray[np.floating], energy: float) -> int:
+    """How many of the largest values hold this share of their sum; 0 if they are all 0."""
+    missing = ascending.sum() * energy
     count = 0
     while missing > 0.0 and count < len(ascending):
         count += 1
@@ -281,7 +303,7 @@ def _count_largest(ascending: NDArray[np.floating]) -> int:
 
 def _share(fraction: float, n: int) -> int:
     """A share of n vertices, of which there are at least two."""
-    return min(n, max(LEAST_DENSE, round(fraction * n)))
+    return min(n, max(2, round(fraction * n)))
 
 
 def _word(value: int) -> NDArray[np.uint64]:

@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.tessellation import TriangleMesh
-
-#: Samples per vertex for the directional albedo of a BSDF that is not diffuse (stratified, 8 x 8).
-ALBEDO_STRATA = 8
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 #: BSDFs and textures that do not vary over the surface nor with its rotation.
 PLAIN = {"SmoothDiffuse", "TwoSided", "UniformSpectrum", "SRGBReflectanceSpectrum"}
@@ -29,7 +26,7 @@ SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 BUMPED = {"NormalMap", "BumpMap"}
 
 
-def kind(bsdf: mi.BSDF) -> str:
+def bsdf_class(bsdf: mi.BSDF) -> str:
     """The class of a BSDF, also of one that is written in Python."""
     own = type(bsdf).__name__
     return own if own != "BSDF" else str(bsdf.class_name())
@@ -68,7 +65,7 @@ class Material:
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {kind(self.bsdf)} {what}; matrices treat its vertices as diffuse "
+                f"shape '{name}': BSDF {bsdf_class(self.bsdf)} {what}; matrices treat its vertices as diffuse "
                 "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
             )
         if self._emitter is not None:
@@ -125,7 +122,7 @@ class Material:
         """The share of light from the normal's direction that is scattered: a mean of stratified samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
-        n = ALBEDO_STRATA
+        n = 8  # strata per axis
         for k in range(n * n):
             # The lobe's random number runs in bit-reversed order, so that each lobe sees the whole square.
             lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n
@@ -141,11 +138,12 @@ class Material:
         if not self._classes <= SHOWN:
             return False
         if "MeshAttribute" in self._classes and not all(
-            _even(values) for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
+            _has_equal_channels(values)
+            for values in (*mesh.vertex_attributes.values(), *mesh.face_attributes.values())
         ):
             return False
         parameters = mi.traverse(self.bsdf)
-        return all(_even(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
+        return all(_has_equal_channels(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
         """SHA-256 of the BSDF's text and of all parameters that `mi.traverse` shows, bitmaps included."""
@@ -158,7 +156,7 @@ class Material:
         return state.digest()
 
 
-def _even(value: Any) -> bool:
+def _has_equal_channels(value: Any) -> bool:
     """Whether colours, a `mi.Color3f` or [..., channel], have equal channels; other things always do."""
     values = np.array(value, np.float64)
     if isinstance(value, mi.Color3f):

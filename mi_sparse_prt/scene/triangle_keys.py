@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import hash_rows, mix
-from mi_sparse_prt.scene.tessellation import TriangleMesh
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 
 def triangle_keys(mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64) -> NDArray[np.uint64]:

@@ -17,7 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.core.sparse_product import gathered, product
+from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
 from mi_sparse_prt.operators.operator import Operator
 
@@ -113,7 +113,7 @@ def _basis(
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
     while True:
         block = _combinations(matrix, albedo, direct, rng)
-        new = (block if shorten is None else product(shorten, block)).astype(np.float64)
+        new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
         known = turn.T @ np.concatenate([np.zeros((0, new.shape[1])), *products[:-1]])
@@ -148,7 +148,7 @@ def _combinations(
     found, draws = [], max(1, DRAWS // len(albedo))
     for rho in albedo:
         mixed = np.hstack([random_combinations(direct, MIXED, rng) for _ in range(draws)])
-        found.append(gathered(matrix, rho[None], mixed)[0])
+        found.append(multiply_scaled(matrix, rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
 
 
@@ -197,7 +197,7 @@ def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator) -> F
     rho = np.ascontiguousarray(albedo[:, touched])
     result = np.empty((len(rho), shape[0], direct.shape[1]), np.float32)
     for texels, light in ColumnBlocks(direct.take(touched)):
-        result[:, :, texels] = gathered(local, rho, light)
+        result[:, :, texels] = multiply_scaled(local, rho, light)
     return result
 
 

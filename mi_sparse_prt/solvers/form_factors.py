@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.shape_table import ShapeTable, first_triangles
 
 LANES = 1 << 23  # rays per wavefront
 # In place of a vertex: what a ray meets if it is not the front of a surface
@@ -77,18 +78,16 @@ class Surfaces:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene.normalised
         shapes = scene.normalised.shapes()
-        number = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)).numpy()[0]) for shape in shapes]
-        first = np.zeros(max(number) + 1, np.uint32)  # triangle of each shape, by its number in Dr.Jit
-        lengths = [len(mesh.triangles) for mesh in scene.meshes]
-        first[number] = np.cumsum([0, *lengths[:-1]])
         two_sided = np.array([mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide) for shape in shapes])
-        back = np.full(len(first), NOTHING, np.uint32)  # what rays from behind find
-        back[number] = np.where(two_sided, BEHIND, NOTHING)
         self._two_sided = [mesh.name for mesh, both in zip(scene.meshes, two_sided, strict=True) if both]
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
-        self._first, self._triangles = mi.UInt32(first), mi.UInt32(triangles.astype(np.uint32).ravel())
-        self._normals, self._back = mi.Vector3f(scene.normals.T), mi.UInt32(back)
-        dr.eval(self._first, self._triangles, self._normals, self._back)
+        self._first_triangle = first_triangles(self._scene)
+        self._back = ShapeTable(
+            self._scene, np.where(two_sided, BEHIND, NOTHING)
+        )  # what rays from behind find
+        self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
+        self._normals = mi.Vector3f(scene.normals.T)
+        dr.eval(self._triangles, self._normals)
 
     def seen_from(
         self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
@@ -104,8 +103,7 @@ class Surfaces:
     def _vertex(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
         """The corner of each hit triangle that u in [0, 1) selects."""
         valid = hit.is_valid()
-        shape = dr.reinterpret_array(mi.UInt32, hit.shape)
-        first = dr.gather(mi.UInt32, self._first, shape, valid)
+        first = self._first_triangle.gather(hit.shape, valid)
         corners = [
             dr.gather(mi.UInt32, self._triangles, 3 * (first + hit.prim_index) + k, valid) for k in range(3)
         ]
@@ -116,7 +114,7 @@ class Surfaces:
             normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
         chosen = dr.select(u < b[0], corners[1], dr.select(u < b[0] + b[1], corners[2], corners[0]))
         front = dr.dot(normal, direction) < 0  # of the shading normal, as for Mitsuba's BSDFs
-        chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._back, shape, valid))
+        chosen = dr.select(front, chosen, self._back.gather(hit.shape, valid))
         return dr.select(valid, chosen, NOTHING)
 
     def check_backs(self, behind: int, met: int) -> None:

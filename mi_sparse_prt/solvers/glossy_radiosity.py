@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
@@ -185,9 +186,7 @@ def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) ->
     own = slice(channel * terms, (channel + 1) * terms)
     entries = 1 + terms * (number[rays.seen] >= 0)  # of a ray, in each row that it is in
     lengths = np.bincount(rays.point, weights=entries, minlength=n).astype(np.int64)
-    starts = np.concatenate(
-        [[0], np.cumsum(np.concatenate([lengths, np.repeat(lengths[direct.glossy], terms)]))]
-    )
+    starts = row_starts(np.concatenate([lengths, np.repeat(lengths[direct.glossy], terms)]))
     columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
     first = np.searchsorted(rays.point, np.arange(n + 1))
     into, out = rays.into / np.float32(rays.per_vertex), np.ascontiguousarray(rays.out[:, own])

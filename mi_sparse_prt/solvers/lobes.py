@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reflection.factor_tables import incident_tables, looked_up
+from mi_sparse_prt.reflection.factor_tables import incident_tables, look_up
 from mi_sparse_prt.reflection.frames import frames
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.form_factors import BEHIND
@@ -59,7 +59,7 @@ class Lobes:
         self, table: mi.Float, vertex: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
     ) -> list[mi.Float]:
         material = dr.gather(mi.UInt32, self._material, vertex, valid)
-        return looked_up(table, self._size, self._terms, material, local, valid)
+        return look_up(table, self._size, self._terms, material, local, valid)
 
 
 def _with_dark(tables: Floats) -> mi.Float:

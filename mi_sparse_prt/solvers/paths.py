@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.random_generator import random_generator
+from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray

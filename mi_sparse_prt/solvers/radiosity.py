@@ -21,7 +21,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.sparse_product import gathered, product
+from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
@@ -108,7 +108,7 @@ class FiniteElements:
         count = self.bounces(columns.sum(axis=1))
         for a in range(0, columns.shape[1] if count else 0, COLUMNS):
             part = slice(a, a + COLUMNS)
-            light = list(gathered(self.matrix, self._albedo, columns[:, part]))
+            light = list(multiply_scaled(self.matrix, self._albedo, columns[:, part]))
             totals = light
             for _ in range(count - 1):
                 light = self._reflected(light)
@@ -145,7 +145,7 @@ class FiniteElements:
         weights[ids, np.arange(len(ids))] = 1
         total = np.zeros_like(weights)
         for _ in range(count):
-            weights = rho[:, None] * product(self._transposed, self.nodes.collect(weights))
+            weights = rho[:, None] * multiply_sparse(self._transposed, self.nodes.collect(weights))
             total += weights
         return total
 
@@ -217,7 +217,7 @@ class FiniteElements:
             If ``max_depth`` is -1 and light does not end, between white surfaces that let none escape.
         """
         total, count = 0.0, 0
-        light = list(gathered(self.matrix, self._albedo, even[:, None]))
+        light = list(multiply_scaled(self.matrix, self._albedo, even[:, None]))
         while self.max_depth < 0 or count < self.max_depth - 2:
             peak = max(float(x.max(initial=0)) for x in light)
             if peak == 0:
@@ -248,7 +248,7 @@ class FiniteElements:
     def _reflected(self, light: list[Floats]) -> list[Floats]:
         """One bounce: G rho W x for arrays x (n_nodes, any), one per channel."""
         pairs = zip(self._albedo, light, strict=True)
-        return [gathered(self.matrix, rho[None], self.nodes.spread(x))[0] for rho, x in pairs]
+        return [multiply_scaled(self.matrix, rho[None], self.nodes.spread(x))[0] for rho, x in pairs]
 
 
 class RadiositySolver(FiniteElements):

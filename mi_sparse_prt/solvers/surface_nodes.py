@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.sparse_product import product
+from mi_sparse_prt.core.sparse_product import multiply_sparse
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Nodes:
 
     def spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Light (n, k) of the nodes, interpolated at all vertices (n_v, k)."""
-        return light if self.weights is None else product(self.weights, light)
+        return light if self.weights is None else multiply_sparse(self.weights, light)
 
     def collect(self, weights: NDArray[np.float32]) -> NDArray[np.float32]:
         """The transpose of ``spread``: weights of all vertices (n_v, k) as weights of nodes (n, k)."""
-        return weights if self.weights is None else product(self._transposed, weights)
+        return weights if self.weights is None else multiply_sparse(self._transposed, weights)
 
     @cached_property
     def _transposed(self) -> scipy.sparse.csr_array:

@@ -19,7 +19,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, counts, listed, lowest
+from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, count_bits, list_bits, lowest_bit
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.emission.texel_adjacency import Sides, TexelSides
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -71,20 +72,17 @@ def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalV
     for a in range(0, len(bits), BLOCK):
         block = bits[a : a + BLOCK]
         above = above_horizon(normals[a : a + BLOCK], direct.lighting.directions)
-        crossed = sides.crossed(block, above)
-        rows, pairs = listed(crossed)
+        crossed = sides.find_crossed(block, above)
+        rows, pairs = list_bits(crossed)
         first = sides.tables.first[pairs]
         first_seen = (block[rows, first // BITS] >> (first % BITS).astype(np.uint32)) & np.uint32(1)
         places = _bisected(direct, paths, rows + np.uint32(a), pairs, first_seen)
-        blocks.append(_cut_texels(sides, block, above, Crossings(_starts(counts(crossed)), pairs, places)))
+        blocks.append(
+            _cut_texels(sides, block, above, Crossings(row_starts(count_bits(crossed)), pairs, places))
+        )
         rays += STEPS * len(pairs)
     seen, number, texels, shares = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    return FractionalVisibility(seen, _starts(number), texels, shares, normals, direct.lighting), rays
-
-
-def _starts(number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where so many entries each begin in a list of all, and its length."""
-    return np.concatenate([[0], np.cumsum(number)])
+    return FractionalVisibility(seen, row_starts(number), texels, shares, normals, direct.lighting), rays
 
 
 def _bisected(
@@ -114,14 +112,14 @@ def _cut_texels(
     sides: TexelSides, bits: Bits, above: Bits, crossings: Crossings
 ) -> tuple[Bits, NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
     """Bits, and for each vertex how many texels are seen in part, which, and their shares."""
-    horizon = sides.crossed(above, np.full_like(above, 0xFFFFFFFF))
+    horizon = sides.find_crossed(above, np.full_like(above, 0xFFFFFFFF))
     m = len(sides.tables.beside)
-    room = _starts(np.minimum(AROUND * np.diff(crossings.starts) + counts(horizon), m))
+    room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + count_bits(horizon), m))
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)
     number = np.empty(len(bits), np.int64)
     threads = numba.get_num_threads()
     _find_shares(sides.tables, bits, above, horizon, crossings, threads, room, seen, entries, number)
-    starts = _starts(number)
+    starts = row_starts(number)
     texels, shares = np.empty(starts[-1], np.min_scalar_type(m - 1)), np.empty(starts[-1], np.uint8)
     _unpack(entries, room, starts, texels, shares)
     return seen, number, texels, shares
@@ -161,7 +159,7 @@ def _find_shares(
             for w in range(horizon.shape[1]):
                 left = horizon[i, w]
                 while left:
-                    pair = w * BITS + np.int64(lowest(left))  # type: ignore[call-arg]  # numba gives the context
+                    pair = w * BITS + np.int64(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
                     left &= left - np.uint32(1)
                     texel = sides.second[pair] if bit_of(above[i], sides.first[pair]) else sides.first[pair]
                     if done[texel] != i:

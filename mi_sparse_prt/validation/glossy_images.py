@@ -32,7 +32,9 @@ from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
-from mi_sparse_prt.scene.scene import Scene, watertight_scene
+from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation import matrix_figures as draw
 
@@ -310,10 +312,9 @@ class _References:
         place = mi.Point2f(np.stack([x.ravel(), y.ravel()]).astype(np.float32))
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), place, mi.Point2f(0.5))
         si = self._scene.mitsuba.ray_intersect(ray)
-        every = dr.reinterpret_array(mi.UInt32, self._scene.mitsuba.shapes_dr()).numpy()
-        number = np.full(int(every.max()) + 1, -1)
-        number[every] = np.arange(len(every))
-        shape = number[np.where(si.is_valid().numpy(), dr.reinterpret_array(mi.UInt32, si.shape).numpy(), 0)]
+        table = ShapeTable(self._scene.mitsuba, np.arange(len(self._scene.meshes)))
+        number = table.gather(si.shape, si.is_valid()).numpy()
+        shape = np.where(si.is_valid().numpy(), number.astype(np.int64), -1)
         return shape.reshape(height, width), np.array(si.sh_frame.n).T.reshape(height, width, 3)
 
 

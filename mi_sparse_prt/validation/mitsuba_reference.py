@@ -11,7 +11,8 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
-from mi_sparse_prt.scene.scene import Scene, watertight_scene
+from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
+from mi_sparse_prt.scene.scene import Scene
 
 
 class ReferenceMatrix:
@@ -56,7 +57,7 @@ class ReferenceMatrix:
             }
         )
         self._sensor = self._scene.sensors()[0]
-        self._sensor.bind(self._scene, rays.chosen(vertices))
+        self._sensor.bind(self._scene, rays.take(vertices))
         self._parameters = mi.traverse(self._scene)
         self._lighting, self._basis = lighting, basis
 

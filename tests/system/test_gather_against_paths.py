@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.reconstruction import node_placement as nodes_module
+from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
@@ -67,7 +67,7 @@ def test_still_life(artefact):
 
 
 @pytest.mark.filterwarnings("ignore:.*faces point inwards")
-def test_an_integrating_sphere(artefact, monkeypatch):
+def test_an_integrating_sphere(artefact):
     """Rationale: inside a sphere every point sees every area alike, so every bounce is known in closed form.
 
     A hollow sphere of albedo r = 0.8, open above a polar angle of 60 degrees: the opening is the share f = 0.25 of the
@@ -104,8 +104,7 @@ def test_an_integrating_sphere(artefact, monkeypatch):
     axes.set(xlabel="height", ylabel="irradiance / pi")
     axes.legend()
     artefact(figure)
-    monkeypatch.setattr(nodes_module, "SMALL", 1000)
-    nodes = nodes_module.choose_nodes(scene, points, 1000)
+    nodes = choose_nodes(scene, points, 1000, small=1000)
     some = RadiositySolver(scene, lighting, points, 256, max_depth=-1, nodes=nodes)
     value = even[:, 0] + some.apply(even)[:, 0, 0]
     print(

@@ -14,7 +14,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
-from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, factor_cache, factor_error
+from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, FactorOptions, factor_cache
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.term_paths import TermPaths
 
@@ -54,8 +54,8 @@ SOFT = np.concatenate(  # one even light, and some that fall off from six sides:
 def coarse_factors(monkeypatch, tmp_path) -> None:
     """Both sides have the same factors, so that coarse ones will do."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: DirectionGrid(16, 32))
-    monkeypatch.setattr(factor_error, "HELD_OUT", 1 << 12)
+    coarse = FactorOptions(DirectionGrid(16, 32), 1 << 12)
+    monkeypatch.setattr(factor_cache, "FactorOptions", lambda: coarse)
 
 
 @dataclass

@@ -84,7 +84,7 @@ def compare(
     points, channels = sensor_points(scene, rays), 1 if scene.grey else 3
     path = PathSolver(scene.normalised, lighting, points, basis, max_depth, spp, channels, seed=1)
     estimate = path.elements(vertex, texel)
-    direct, indirect = mitsuba_columns(scene, rays.chosen(rows), lighting, basis, max_depth, *reference)
+    direct, indirect = mitsuba_columns(scene, rays.take(rows), lighting, basis, max_depth, *reference)
     result = []
     for c in range(channels):
         scale = (scene.albedo[vertex, c] * lighting.solid_angles[texel]).astype(np.float64).reshape(shape)

@@ -137,7 +137,7 @@ def test_bound_to_other_vertices():
         sensor.bind(other.mitsuba)
     some = np.arange(5)
     few = mi.load_dict({"type": "mesh_vertices", "vertices": 5})
-    assert few.bind(other.mitsuba, vertex_rays(other.mitsuba).chosen(some)).origins.shape == (5, 3)
+    assert few.bind(other.mitsuba, vertex_rays(other.mitsuba).take(some)).origins.shape == (5, 3)
 
 
 def test_bad_parameters():

@@ -108,7 +108,6 @@ def test_block_size(monkeypatch):
     for lanes in (1 << 22, 1 << 14):
         monkeypatch.setattr("mi_sparse_prt.solvers.direct_rays.LANES", lanes)
         monkeypatch.setattr("mi_sparse_prt.solvers.paths.LANES", lanes)
-        monkeypatch.setattr("mi_sparse_prt.sampling.consensus.BLOCK", lanes >> 12)
         whole, parts = (
             parts,
             rows(prt.precompute(scene("home"), LIGHTING, "sparse", max_depth=4, spp=4, progress=False)),

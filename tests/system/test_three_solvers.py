@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.reconstruction import node_placement as nodes_module
+from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import Estimate, PathSolver
@@ -257,17 +257,16 @@ def test_finite_elements_among_the_others(artefact):
 
 
 @pytest.mark.parametrize("most_nodes", [1000, 150])
-def test_inner_product_of_finite_elements(coloured_scene, monkeypatch, most_nodes):
+def test_inner_product_of_finite_elements(coloured_scene, most_nodes):
     """Rationale: <m, S V E> = <(S V)* m, E>: bounces forward from a light, and in reverse from the vertices.
 
     Coloured still life, light gathered at all 313 vertices or at half of them; three random pairs, m of both signs.
 
     Expected: equal but for rounding, 1e-5 of the same sum over |m|.
     """
-    monkeypatch.setattr(nodes_module, "SMALL", 50)
     lighting, rng = prt.CubemapLighting(4), np.random.default_rng(3)
     points = vertex_points(coloured_scene)
-    nodes = nodes_module.choose_nodes(coloured_scene, points, most_nodes)
+    nodes = choose_nodes(coloured_scene, points, most_nodes, small=50)
     gather = RadiositySolver(coloured_scene, lighting, points, 64, nodes=nodes)
     assert (len(gather.nodes) < 200) == (most_nodes == 150)
     direct = direct_part(coloured_scene, lighting)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.core.bits import counts, unpack
+from mi_sparse_prt.core.bits import count_bits, unpack
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
 
 GRIDS = {n: AngularGrid(prt.CubemapLighting(n)) for n in (1, 2, 4, 8, 16)}
@@ -163,7 +163,7 @@ def test_each_element_is_asked_once_and_only_above_the_horizon():
     rows = grid.sample(normals, visible)
     assert len(asked) == 2
     i, j = np.concatenate(asked, axis=1).astype(int)
-    assert len(set(zip(i, j, strict=True))) == len(i) == counts(rows.evaluated).sum()
+    assert len(set(zip(i, j, strict=True))) == len(i) == count_bits(rows.evaluated).sum()
     assert (np.einsum("ix,ix->i", normals[i], grid.lighting.directions[j]) > 0).all()
     assert sampled(grid)[asked[0][1]].all()
     assert not sampled(grid)[asked[1][1]].any()

@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.core.bits import above_horizon, counts, listed, overwrite, pack, scattered, unpack
+from mi_sparse_prt.core.bits import (
+    above_horizon,
+    count_bits,
+    list_bits,
+    overwrite_bits,
+    pack,
+    scatter_bits,
+    unpack,
+)
 
 MASKS = st.tuples(st.integers(0, 5), st.integers(0, 100)).flatmap(lambda shape: arrays(bool, shape))
 
@@ -55,20 +63,20 @@ def test_unpack_reads_strided_rows():
 @settings(deadline=None)
 def test_counts(bits):
     expected = [sum(bin(word).count("1") for word in row) for row in bits.tolist()]
-    assert counts(bits).tolist() == expected
+    assert count_bits(bits).tolist() == expected
 
 
 def test_counts_of_every_kind_of_word():
     """Each bit alone, all but each bit, none, all: a wrong mask of the field sums would show."""
     single = np.uint32(1) << np.arange(32, dtype=np.uint32)
     words = np.concatenate([single, ~single, np.uint32([0, 0xFFFFFFFF])])[:, None]
-    assert counts(words).tolist() == [1] * 32 + [31] * 32 + [0, 32]
+    assert count_bits(words).tolist() == [1] * 32 + [31] * 32 + [0, 32]
 
 
 @given(MASKS)
 @settings(deadline=None)
 def test_listed_is_nonzero(mask):
-    rows, directions = listed(pack(mask))
+    rows, directions = list_bits(pack(mask))
     expected = np.nonzero(mask)
     assert np.array_equal(rows, expected[0])
     assert np.array_equal(directions, expected[1])
@@ -81,14 +89,14 @@ def test_scattered_is_the_inverse_of_listed(mask, seed):
     values = np.random.default_rng(seed).random(mask.sum()) < 0.5
     expected = np.zeros_like(mask)
     expected[mask] = values
-    assert np.array_equal(unpack(scattered(pack(mask), values), mask.shape[1]), expected)
+    assert np.array_equal(unpack(scatter_bits(pack(mask), values), mask.shape[1]), expected)
 
 
 def test_scattered_keeps_to_the_mask():
     bits = np.random.default_rng(2).integers(0, 1 << 32, (50, 7), dtype=np.uint32)
-    m = counts(bits).sum()
-    assert np.array_equal(scattered(bits, np.ones(m, bool)), bits)
-    assert not scattered(bits, np.zeros(m, bool)).any()
+    m = count_bits(bits).sum()
+    assert np.array_equal(scatter_bits(bits, np.ones(m, bool)), bits)
+    assert not scatter_bits(bits, np.zeros(m, bool)).any()
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 8])
@@ -116,9 +124,9 @@ def test_a_direction_in_the_horizon_is_not_above():
 
 def test_no_rows():
     empty = np.zeros((0, 3), np.uint32)
-    assert counts(empty).shape == (0,)
-    assert [len(x) for x in listed(empty)] == [0, 0]
-    assert scattered(empty, np.zeros(0, bool)).shape == (0, 3)
+    assert count_bits(empty).shape == (0,)
+    assert [len(x) for x in list_bits(empty)] == [0, 0]
+    assert scatter_bits(empty, np.zeros(0, bool)).shape == (0, 3)
     assert above_horizon(np.zeros((0, 3), np.float32), unit(40)).shape == (0, 2)
 
 
@@ -134,7 +142,7 @@ def test_overwrite(n):
     expected[rows] = np.where(mask, after, bits[rows])
     expected_known[rows] |= mask
     packed, packed_known = pack(bits), pack(known)
-    changed = overwrite(packed, packed_known, rows, pack(mask), values)
+    changed = overwrite_bits(packed, packed_known, rows, pack(mask), values)
     assert np.array_equal(unpack(packed, n), expected)
     assert np.array_equal(unpack(packed_known, n), expected_known)
     assert changed.tolist() == ((after != bits[rows]) & mask).sum(axis=1).tolist()

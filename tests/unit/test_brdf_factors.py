@@ -10,11 +10,13 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.reflection.brdf_factors import (
     DirectionGrid,
     diffuse_reflectance,
-    evaluated,
+    evaluate_brdf,
     factor_brdf,
-    factor_error,
+    measure_factor_error,
 )
-from mi_sparse_prt.reflection.brdf_factors import factorization as making
+from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
+from mi_sparse_prt.reflection.brdf_factors.factor_error import sample_pairs
+from mi_sparse_prt.reflection.brdf_factors.factorization import glossy_rows
 
 SMALL = DirectionGrid(12, 24)
 TINY = DirectionGrid(8, 16)
@@ -59,14 +61,14 @@ def test_interpolation():
     """Grid points give their own values, angles between them are linear, azimuths close; nothing below the horizon."""
     rng = np.random.default_rng(0)
     values = rng.standard_normal((2, 3, 12 * 24)).astype(np.float32)
-    assert np.allclose(SMALL.interpolated(values, SMALL.directions), values, atol=2e-5)
-    assert not SMALL.interpolated(values, -SMALL.directions).any()
+    assert np.allclose(SMALL.interpolate(values, SMALL.directions), values, atol=2e-5)
+    assert not SMALL.interpolate(values, -SMALL.directions).any()
     every = SMALL.directions
     theta, phi = np.arccos(every[:, 2]), np.arctan2(every[:, 1], every[:, 0])
     t, p = rng.uniform(0.15, 1.4, 500), rng.uniform(-np.pi, np.pi, 500)
     between = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=1).astype(np.float32)
-    assert np.allclose(SMALL.interpolated(theta, between), t, atol=1e-5)
-    smooth = SMALL.interpolated(np.cos(phi), between)
+    assert np.allclose(SMALL.interpolate(theta, between), t, atol=1e-5)
+    smooth = SMALL.interpolate(np.cos(phi), between)
     assert np.abs(smooth - np.cos(p)).max() < (2 * np.pi / 24) ** 2 / 8 + 1e-5
 
 
@@ -86,8 +88,8 @@ def test_a_diffuse_surface_needs_no_terms():
     factors = factor_brdf(bsdf, "wall", 2, SMALL)
     assert factors.diffuse == pytest.approx([0.2, 0.5, 0.7], rel=1e-5)
     wi, wo, _ = pairs(SMALL)
-    assert np.abs(factors.values(wi, wo) - evaluated(bsdf, "wall", wi, wo)).max() < 1e-5
-    assert factor_error(factors, bsdf, "wall").terms_for(1e-3) == 1
+    assert np.abs(factors.values(wi, wo) - evaluate_brdf(bsdf, "wall", wi, wo)).max() < 1e-5
+    assert measure_factor_error(factors, bsdf, "wall").terms_for(1e-3) == 1
 
 
 def light_products(grid: DirectionGrid) -> np.ndarray:
@@ -117,7 +119,7 @@ def test_no_factors_of_that_rank_are_better(kind):
     areas, n = TINY.solid_angles, len(TINY.directions)
     light = light_products(TINY) * areas[:, None] * areas
     seen = np.sqrt(areas * TINY.directions[:, 2])[:, None]
-    true = evaluated(bsdf, "ball", wi, wo).astype(np.float64)
+    true = evaluate_brdf(bsdf, "ball", wi, wo).astype(np.float64)
     for terms in (1, 4, 16):
         factors = factor_brdf(bsdf, "ball", terms, TINY)
         channels = len(factors.diffuse)
@@ -138,7 +140,7 @@ def test_even_light_is_nearly_exact():
     wi, wo, _ = pairs(grid)
     shape = (len(grid.directions), -1)
     true, found = (
-        evaluated(phong(20), "ball", wi, wo)[:, 0].reshape(shape),
+        evaluate_brdf(phong(20), "ball", wi, wo)[:, 0].reshape(shape),
         factors.values(wi, wo).reshape(shape),
     )
     seen = grid.solid_angles * grid.directions[:, 2]
@@ -199,9 +201,9 @@ def test_errors_are_those_of_even_pairs():
     """400 000 pairs that are drawn without regard to the BSDF: the same relative error, within 3%."""
     bsdf = phong(10)
     factors = factor_brdf(bsdf, "ball", 6, DirectionGrid(24, 48))
-    error = factor_error(factors, bsdf, "ball")
+    error = measure_factor_error(factors, bsdf, "ball")
     wi, wo = even_pairs(400_000)
-    true = evaluated(bsdf, "ball", wi, wo)[:, 0].astype(np.float64)
+    true = evaluate_brdf(bsdf, "ball", wi, wo)[:, 0].astype(np.float64)
     for terms in (1, 3, 6):
         missing = factors.first(terms).values(wi, wo)[:, 0] - true
         known = np.sqrt((missing**2).sum() / (true**2).sum())
@@ -221,12 +223,12 @@ def test_held_out_pairs_stand_for_all(kind):
     """
     bsdf = phong(10) if kind == "phong" else mi.load_dict(BRUSHED)
     even = even_pairs(1_000_000)
-    *drawn, weights = factor_error._held_out(bsdf, 1)
+    *drawn, weights = sample_pairs(bsdf, 1 << 17, 1)
     assert weights.sum() == pytest.approx(2 * np.pi**2, rel=0.005)
 
     def squares(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
         high = np.minimum(wi[:, 2], wo[:, 2]) > np.sin(np.radians(15))
-        return high * evaluated(bsdf, "ball", wi, wo)[:, 0].astype(np.float64) ** 2
+        return high * evaluate_brdf(bsdf, "ball", wi, wo)[:, 0].astype(np.float64) ** 2
 
     known = squares(*even) * (2 * np.pi**2 / len(even[0]))
     found = squares(*drawn) * weights
@@ -277,7 +279,7 @@ def test_a_diffuse_part_that_varies_is_left_out(kind):
     found = factors.values(SMALL.directions, towards) + local * SMALL.directions[:, 2:] / np.pi
     if kind == "diffuse":
         assert np.abs(found - true).max() < 1e-6
-        assert factor_error(factors, bsdf, "wall").whole.max() == 0
+        assert measure_factor_error(factors, bsdf, "wall").whole.max() == 0
     else:
         dull = SMALL.directions[:, 2:] / np.pi
         constant = factor_brdf(phong(10), "wall", 16, SMALL).values(SMALL.directions, towards) - 0.3 * dull
@@ -288,9 +290,11 @@ def test_a_diffuse_part_that_varies_is_left_out(kind):
 def test_errors_without_the_diffuse_part():
     """Relative to the lobe alone: the squares are those of the same lobe over a constant part."""
     bsdf, plain = textured("phong", exponent=10.0, specular_reflectance=0.4), phong(10)
-    lobe, whole = (factor_error(factor_brdf(b, "wall", 3, SMALL), b, "wall").whole for b in (bsdf, plain))
+    lobe, whole = (
+        measure_factor_error(factor_brdf(b, "wall", 3, SMALL), b, "wall").whole for b in (bsdf, plain)
+    )
     wi, wo = even_pairs(1 << 17)
-    true = evaluated(plain, "wall", wi, wo)[:, 0].astype(np.float64)
+    true = evaluate_brdf(plain, "wall", wi, wo)[:, 0].astype(np.float64)
     ratio = np.sqrt((true**2).sum() / ((true - 0.3 * wi[:, 2] / np.pi) ** 2).sum())
     assert lobe == pytest.approx(whole * ratio, rel=0.03)
 
@@ -327,8 +331,14 @@ def test_refused_by_name(bsdf, problem):
     assert "\n" not in str(error.value)
 
 
-def test_values_that_are_no_numbers(monkeypatch):
-    monkeypatch.setattr(making, "LANES", 1 << 12)
+def test_rows_do_not_depend_on_how_many_are_made_at_a_time():
+    part = GlossyPart(phong(20, (0.1, 0.2, 0.3)), "vase")
+    whole, parts = (list(glossy_rows(part, SMALL, lanes)) for lanes in (1 << 21, 1 << 12))
+    assert len(whole) == 1 < len(parts)
+    np.testing.assert_array_equal(np.concatenate([values for _, values in parts]), whole[0][1])
+
+
+def test_values_that_are_no_numbers():
     bsdf = phong(10)
     values = mi.traverse(bsdf)
     values["specular_reflectance.value"] = mi.Color3f(3e38)
@@ -342,5 +352,5 @@ def test_mitsubas_own(kind):
     """Rough enough for the small grid: a third of the error of one term is gone with sixteen."""
     rough = {"roughness": 0.5} if kind == "principled" else {"alpha": 0.4}
     bsdf = mi.load_dict({"type": kind, **rough})
-    error = factor_error(factor_brdf(bsdf, "ball", 16, DirectionGrid(24, 48)), bsdf, "ball")
+    error = measure_factor_error(factor_brdf(bsdf, "ball", 16, DirectionGrid(24, 48)), bsdf, "ball")
     assert error.whole[15] < 0.67 * error.whole[0]

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from conftest import GREY, build, still_life
+from interior_point import interior_point_fit
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.columns import (
@@ -36,7 +37,6 @@ from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import RELATIVE_LAMBDA
-from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -224,9 +224,8 @@ def test_errors_are_those_of_vertices_one_at_a_time(scene: prt.Scene, lighting: 
         weight = rows[near].var(axis=0) * features[near].sum(axis=0)
         best = [j for j in np.argsort(-weight, kind="stable")[:23] if weight[j] > 0]
         A, y = rows[near][:, best].T, exact[best]
-        a = l1_fit(
-            (A.T @ A)[None], (A.T @ y)[None], (y @ y)[None], RELATIVE_LAMBDA, "interior_point"
-        ).weights[0]
+        products = (A.T @ A)[None], (A.T @ y)[None], (y @ y)[None]
+        a = interior_point_fit(*products, RELATIVE_LAMBDA).weights[0]
         squared += ((a @ rows[near] - exact) ** 2).sum()
     assert np.sqrt(_by_vertex(local, 23, 1).squared.sum()) == pytest.approx(np.sqrt(squared), rel=1e-3)
 

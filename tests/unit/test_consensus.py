@@ -5,13 +5,13 @@ import pytest
 
 from mi_sparse_prt import CubemapLighting
 from mi_sparse_prt.core.bits import unpack
-from mi_sparse_prt.sampling import consensus
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.consensus import STRIDES, Consensus, Surface, by_levels
+from mi_sparse_prt.sampling.consensus import Consensus, ConsensusOptions, Surface, sample_by_levels
 
 LIGHTING = CubemapLighting(16)
 GRID = AngularGrid(LIGHTING)
 SIDE = 48
+STRIDES = ConsensusOptions().strides
 BALL, RADIUS = np.array([0.1, 0.35, -0.05]), 0.25
 
 
@@ -46,9 +46,9 @@ class Plane:
     def surface(self) -> Surface:
         return Surface(0, self.positions, self.normals, self.order.astype(np.uint64))
 
-    def state(self) -> Consensus:
-        state = Consensus(self.normals, GRID, self.trace)
-        by_levels(state, self.surface())
+    def state(self, **options: int) -> Consensus:
+        state = Consensus(self.normals, GRID, self.trace, ConsensusOptions(**options))
+        sample_by_levels(state, self.surface())
         return state
 
 
@@ -78,7 +78,7 @@ def test_nothing_in_the_way_needs_no_ray_but_those_of_the_first_level():
     state = plane.state()
     visible, evaluated = masks(state)
     np.testing.assert_array_equal(visible, plane.exact())
-    assert (evaluated.any(axis=1)).sum() == len(plane.surface().levels()[0])
+    assert (evaluated.any(axis=1)).sum() == len(plane.surface().levels(STRIDES)[0])
 
 
 def test_the_order_of_vertices_does_not_matter():
@@ -88,17 +88,15 @@ def test_the_order_of_vertices_does_not_matter():
     np.testing.assert_array_equal(a.evaluated[shuffled.order], b.evaluated)
 
 
-def test_the_size_of_blocks_does_not_matter(monkeypatch):
-    whole = Plane().state()
-    monkeypatch.setattr(consensus, "BLOCK", 7)
-    parts = Plane().state()
+def test_the_size_of_blocks_does_not_matter():
+    whole, parts = Plane().state(), Plane().state(block=7)
     np.testing.assert_array_equal(whole.visible, parts.visible)
     np.testing.assert_array_equal(whole.evaluated, parts.evaluated)
 
 
 def test_levels_are_a_partition_and_each_is_spread_evenly():
     plane = Plane()
-    levels = plane.surface().levels()
+    levels = plane.surface().levels(STRIDES)
     np.testing.assert_array_equal(np.sort(np.concatenate(levels)), np.arange(SIDE**2))
     known = np.cumsum([len(level) for level in levels])
     np.testing.assert_allclose(known, SIDE**2 / np.array(STRIDES), atol=1)

@@ -7,7 +7,6 @@ import pytest
 from conftest import build, diffuse, mesh
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.core.random_generator import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.scene import Scene
@@ -203,28 +202,3 @@ def test_points_inside_a_texel(n):
     density = density.numpy().reshape(m, k)
     error = density.std(axis=1, ddof=1) / np.sqrt(k)
     assert (np.abs(density.mean(axis=1) - lighting.solid_angles) < 4.5 * error + 1e-6).all()
-
-
-def test_random_numbers_of_neighbouring_elements_are_unrelated():
-    """First numbers over consecutive keys, texels, samples and seeds: uniform, and without correlation."""
-    n = 1 << 14
-    zero, count = dr.zeros(mi.UInt32, n), dr.arange(mi.UInt32, n)
-
-    def first(key: mi.UInt64, texel: mi.UInt32, sample: mi.UInt32, seed: int) -> np.ndarray:
-        return random_generator(key, texel, sample, seed).next_float32().numpy()
-
-    streams = [
-        first(mi.UInt64(count), zero, zero, 0),
-        first(dr.zeros(mi.UInt64, n), count, zero, 0),
-        first(dr.zeros(mi.UInt64, n), zero, count, 0),
-        first(mi.UInt64(count), zero, zero, 1),
-        first(mi.UInt64(count), zero + 1, zero, 0),
-        first(mi.UInt64(count), zero, zero + 1, 0),
-    ]
-    for numbers in streams:
-        histogram = np.histogram(numbers, 64, (0, 1))[0]
-        chi_square = ((histogram - n / 64) ** 2).sum() / (n / 64)  # 63 degrees of freedom
-        assert chi_square < 63 + 4 * np.sqrt(2 * 63)
-        assert abs(np.corrcoef(numbers[1:], numbers[:-1])[0, 1]) < 4 / np.sqrt(n)
-    correlation = np.corrcoef(streams) - np.eye(len(streams))
-    assert np.abs(correlation).max() < 4 / np.sqrt(n)

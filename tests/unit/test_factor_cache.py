@@ -1,6 +1,7 @@
 """Factors of BRDFs found again on disk: by what the BSDF is, and only if the file is whole."""
 
 import time
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -9,9 +10,16 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, factor_cache, factor_error, factors_of
+from mi_sparse_prt.reflection.brdf_factors import (
+    DirectionGrid,
+    FactorOptions,
+    factor_cache,
+    measure_factor_error,
+)
 
 SMALL = DirectionGrid(10, 20)
+FEW = FactorOptions(SMALL, 1 << 12)
+factors_of = partial(factor_cache.factors_of, options=FEW)
 
 
 class Counted:
@@ -27,8 +35,6 @@ class Counted:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
-    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: SMALL)
-    monkeypatch.setattr(factor_error, "HELD_OUT", 1 << 12)
     counter = Counted()
     monkeypatch.setattr(factor_cache, "factor_brdf", counter)
     return counter
@@ -66,9 +72,9 @@ def bitmap(value: float) -> dict:
 
 def test_what_makes_another_file(counted, tmp_path, monkeypatch):
     any_factors = counted.made(phong(), "vase", 16, SMALL)
-    any_error = factor_error(any_factors, phong(), "vase")
+    any_error = measure_factor_error(any_factors, phong(), "vase", pairs=FEW.pairs)
     counted.made = lambda *_: any_factors  # what they are does not matter here
-    monkeypatch.setattr(factor_cache, "factor_error", lambda *_: any_error)
+    monkeypatch.setattr(factor_cache, "measure_factor_error", lambda *_, **__: any_error)
     brushed = {"type": "ashikhmin_shirley", "exponent_u": 10.0, "exponent_v": 10.0}
     bsdfs = [
         phong(),
@@ -83,8 +89,8 @@ def test_what_makes_another_file(counted, tmp_path, monkeypatch):
     for bsdf in bsdfs:
         factors_of(bsdf, "vase", folder=tmp_path)
     assert counted.calls == len(bsdfs)
-    monkeypatch.setattr(factor_cache, "DirectionGrid", lambda: DirectionGrid(8, 20))
-    factors_of(phong(), "vase", folder=tmp_path)
+    other = FactorOptions(DirectionGrid(8, 20), FEW.pairs)
+    factor_cache.factors_of(phong(), "vase", folder=tmp_path, options=other)
     monkeypatch.setattr(factor_cache, "FORMAT", factor_cache.FORMAT + 1)
     factors_of(phong(), "vase", folder=tmp_path)
     assert counted.calls == len(bsdfs) + 2 == len(list(tmp_path.iterdir()))
@@ -178,7 +184,7 @@ def test_no_folder_is_no_reason_to_stop(counted, tmp_path):
 def test_fewest_terms_for_a_target(counted, tmp_path):
     bsdf = phong(5.0)
     factors_of(bsdf, "vase", folder=tmp_path)
-    error = factor_error(counted.made(bsdf, "vase", 16, SMALL), bsdf, "vase").whole
+    error = measure_factor_error(counted.made(bsdf, "vase", 16, SMALL), bsdf, "vase", pairs=FEW.pairs).whole
     for target in (error[2], (error[7] + error[8]) / 2):
         found = factors_of(bsdf, "vase", target_error=float(target), folder=tmp_path)
         assert error[found.terms - 1] <= target < error[found.terms - 2]

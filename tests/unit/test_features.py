@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, pack, unpack
-from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
+from mi_sparse_prt.sampling.features import choose_features, copy_agreed, find_contested
 
 M = 40  # directions: a word and part of a second
 
@@ -30,7 +30,7 @@ def judged(neighbours: NDArray[np.int32], visible: Bits, known: Bits, above: Bit
     """What is contested, and what is agreed on, of vertices of which nothing was sampled."""
     vertices, agreed = np.arange(len(above)), np.full_like(above, 0xABCDEF)
     copy_agreed(neighbours, visible, known, vertices, above, agreed)
-    return contested(neighbours, visible, known, vertices, above, np.zeros_like(above)), agreed
+    return find_contested(neighbours, visible, known, vertices, above, np.zeros_like(above)), agreed
 
 
 @given(st.integers(0, 6), st.integers(1, 8), st.sampled_from([1, 31, 32, 33, 96]), st.integers(0, 10**6))
@@ -104,7 +104,7 @@ def test_nothing_is_sampled_twice_and_other_rows_are_left_alone():
     above, before = rng.random((6, M)) < 0.5, rng.random((6, M)) < 0.3
     nobody, vertices = np.full((2, 3), -1, np.int32), np.array([4, 1])
     nothing = pack(np.zeros((1, M), bool))
-    differ = contested(nobody, nothing, nothing, vertices, pack(above), pack(before))
+    differ = find_contested(nobody, nothing, nothing, vertices, pack(above), pack(before))
     assert np.array_equal(unpack(differ, M), (above & ~before)[vertices])
     result = pack(before)
     copy_agreed(nobody, nothing, nothing, vertices, pack(above), result)
@@ -138,7 +138,7 @@ def test_best_features_against_a_sort(n, n_dense, count, seed):
     neighbours[(neighbours >= 0).sum(axis=1) == 3] = -1  # thirds are not exact
     rows = (4 * rng.integers(0, 3, (n_dense, M))).astype(np.float32)
     features = rng.random((n_dense, M)) < 0.5
-    chosen = best_features(neighbours, rows, pack(features), count)
+    chosen = choose_features(neighbours, rows, pack(features), count)
     assert chosen.dtype == np.int32
     assert np.array_equal(chosen, naive_best(neighbours, rows, features, count))
 
@@ -150,7 +150,7 @@ def test_real_numbers():
     features = rng.random((30, 200)) < 0.3
     neighbours = some_neighbours(40, 30, rng)
     for count in (1, 20, 199, 200, 350):
-        chosen = best_features(neighbours, rows, pack(features), count)
+        chosen = choose_features(neighbours, rows, pack(features), count)
         expected = naive_best(neighbours, rows, features, count)
         lonely = (neighbours >= 0).sum(axis=1) == 1  # their variance is 0, but for rounding
         assert np.array_equal(chosen[~lonely], expected[~lonely])
@@ -160,7 +160,7 @@ def test_the_weight_is_variance_times_the_number_of_features():
     """Two neighbours; variances 1, 4, 9 and feature counts 2, 2, 1, 0 make weights 2, 8, 9, 0."""
     rows = np.float32([[0, 0, 0, 0], [2, 4, 6, 100]])
     features = np.array([[1, 1, 1, 0], [1, 1, 0, 0]], bool)
-    ask = lambda count: best_features(near([[0, 1]]), rows, pack(features), count)[0].tolist()  # noqa: E731
+    ask = lambda count: choose_features(near([[0, 1]]), rows, pack(features), count)[0].tolist()  # noqa: E731
     assert ask(1) == [2]
     assert ask(2) == [1, 2]
     assert ask(3) == [0, 1, 2]
@@ -174,8 +174,8 @@ def test_the_padding_is_no_neighbour():
     features = np.ones((3, M), bool)
     padded = np.int32([[0, 1, -1, -1]])
     assert np.array_equal(
-        best_features(padded, rows, pack(features), 7),
-        best_features(padded[:, :2], rows, pack(features), 7),
+        choose_features(padded, rows, pack(features), 7),
+        choose_features(padded[:, :2], rows, pack(features), 7),
     )
 
 
@@ -184,4 +184,4 @@ def test_nothing_to_choose(kind):
     rows = np.arange(M, dtype=np.float32) + np.float32([[0], [1 if kind != "no variance" else 0]])
     features = np.full((2, M), kind != "no feature")
     neighbours = np.int32([[-1, -1]]) if kind == "no neighbour" else np.int32([[0, 1]])
-    assert (best_features(neighbours, rows, pack(features), 5) == -1).all()
+    assert (choose_features(neighbours, rows, pack(features), 5) == -1).all()

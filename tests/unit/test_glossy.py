@@ -8,7 +8,7 @@ from conftest import build, diffuse
 import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.operators.direct_columns import DirectColumns
-from mi_sparse_prt.reflection.frames import frames, orthogonal
+from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
 
@@ -56,7 +56,7 @@ def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: GlossyT
         v = direct.glossy[i]
         local = lighting.directions @ turn[v].T
         seen = rows[v] > 0  # above the horizon and not blocked
-        f = glossy.factors[0].grid.interpolated(glossy.factors[0].incident, local)
+        f = glossy.factors[0].grid.interpolate(glossy.factors[0].incident, local)
         expected = f * seen * lighting.solid_angles
         found = rows[scene.n_vertices + 3 * i : scene.n_vertices + 3 * (i + 1)]
         high = local[:, 2] > 0.1
@@ -100,7 +100,7 @@ def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: GlossyTransport) -
     radiance = glossy.relight(light, up)
     v = glossy.glossy[np.argmax(scene.normals[glossy.glossy, 1])]  # the top of the ball
     local = (frames(glossy.tangents, glossy.normals)[v] @ up).astype(np.float32)
-    g = glossy.factors[0].grid.interpolated(glossy.factors[0].outgoing, local[None])[:, 0, 0]
+    g = glossy.factors[0].grid.interpolate(glossy.factors[0].outgoing, local[None])[:, 0, 0]
     expected = glossy.albedo[v] * found.white[v] + g @ found.terms[v]
     np.testing.assert_allclose(radiance[v], expected, rtol=1e-4)
     assert not radiance[scene.normals[:, 1] < -0.01].any()
@@ -173,7 +173,7 @@ def test_tangents_are_orthogonal_to_normals() -> None:
     along = np.concatenate([rng.normal(size=(30, 3)), normals[30:]]).astype(
         np.float32
     )  # the last ones have none
-    turn = frames(orthogonal(along, normals), normals)
+    turn = frames(orthogonalise(along, normals), normals)
     np.testing.assert_allclose(
         turn @ np.moveaxis(turn, 1, 2), np.broadcast_to(np.eye(3), turn.shape), atol=1e-5
     )

@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, evaluated, factor_error, harmonic_factors
+from mi_sparse_prt.reflection.brdf_factors import (
+    DirectionGrid,
+    evaluate_brdf,
+    harmonic_factors,
+    measure_factor_error,
+)
 
 GRID = DirectionGrid(12, 24)
 BRUSHED = {"type": "ashikhmin_shirley", "exponent_u": 5.0, "exponent_v": 60.0}
@@ -41,7 +46,7 @@ def test_the_fit_is_the_best_one(order):
     found = harmonic_factors(bsdf, "vase", order, GRID)
     w, n = GRID.directions, len(GRID.directions)
     wi, wo = np.repeat(w, n, axis=0), np.tile(w, (n, 1))
-    true = evaluated(bsdf, "vase", wi, wo).astype(np.float64)
+    true = evaluate_brdf(bsdf, "vase", wi, wo).astype(np.float64)
     glossy = (true - wi[:, 2:] * found.diffuse / np.pi).reshape(n, -1)
     x, y, z = w.T.astype(np.float64)
     powers = [
@@ -64,11 +69,11 @@ def test_light_that_is_smooth_is_right():
     grid = found.grid
     w, n = grid.directions, len(grid.directions)
     wi, wo = np.repeat(w, n, axis=0), np.tile(w, (n, 1))
-    true, values = evaluated(bsdf, "vase", wi, wo).reshape(n, n, 3), found.values(wi, wo).reshape(n, n, 3)
+    true, values = evaluate_brdf(bsdf, "vase", wi, wo).reshape(n, n, 3), found.values(wi, wo).reshape(n, n, 3)
     seen = (grid.solid_angles * w[:, 2])[:, None]
     picture, missing = (np.tensordot(grid.solid_angles, x, 1) for x in (true, values - true))
     assert np.sqrt((seen * missing**2).sum()) < 0.02 * np.sqrt((seen * picture**2).sum())
-    error = factor_error(found, bsdf, "vase")
+    error = measure_factor_error(found, bsdf, "vase")
     assert len(error.whole) == 9 and error.whole[8] < 0.6 * error.whole[0]
 
 

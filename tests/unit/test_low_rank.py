@@ -5,9 +5,7 @@ import pytest
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reconstruction import denoising
-from mi_sparse_prt.reconstruction.denoising import denoised as factored
-from mi_sparse_prt.reconstruction.denoising import smoothed
+from mi_sparse_prt.reconstruction.denoising import DenoisingOptions, denoise_rows, smooth_rows
 
 R = 4
 LONG = 600  # the longer side of matrices whose error is predicted
@@ -31,7 +29,7 @@ def noisy(
 
 def denoised(rows: NDArray[np.float32], variance: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
     """The matrix and its rank."""
-    found = factored(rows, variance)
+    found = denoise_rows(rows, variance)
     return found.matrix(), found.rank
 
 
@@ -225,8 +223,8 @@ def on_a_ring(n: int, m: int, steps: int) -> NDArray[np.float64]:
 def test_smooth_rows_are_smoothed():
     """A mean of three has 0.58 of the noise; not knowing that rows are smooth costs some of that."""
     clean = on_a_ring(300, 80, 0)
-    found = factored(*noisy(clean, 1.0))
-    better = smoothed(found, smoothing(300))
+    found = denoise_rows(*noisy(clean, 1.0))
+    better = smooth_rows(found, smoothing(300))
     before, after = (error(x.matrix(), clean) for x in (found, better))
     assert after < 0.8 * before
     assert better.rank == found.rank
@@ -235,21 +233,21 @@ def test_smooth_rows_are_smoothed():
 def test_what_is_local_survives_smoothing():
     """Rows that differ from their neighbours by more than noise: smoothing alone would ruin them."""
     clean = on_a_ring(300, 80, 6)
-    found = factored(*noisy(clean, 0.1))
+    found = denoise_rows(*noisy(clean, 0.1))
     plain = (smoothing(300) @ found.left) @ found.right
-    ours = smoothed(found, smoothing(300)).matrix()
+    ours = smooth_rows(found, smoothing(300)).matrix()
     assert error(ours, clean) < 1.02 * error(found.matrix(), clean)
     assert error(ours, clean) < 0.1 * error(plain, clean)
 
 
 def test_the_noise_of_rows_is_known():
-    """What ``smoothed`` compares with: noise in rows of ``left``, that is within the true span of rows."""
+    """What ``smooth_rows`` compares with: noise in rows of ``left``, that is within the true span of rows."""
     clean = truth(400, 300, 4)
     span = np.linalg.svd(clean)[2][:R].T
     deviation = np.geomspace(0.5, 2, 400)[:, None]
     found, expected = np.zeros(400), np.zeros(400)
     for seed in range(8):
-        run = factored(*noisy(clean, deviation, seed))
+        run = denoise_rows(*noisy(clean, deviation, seed))
         found += (((run.matrix() - clean) @ span) ** 2).sum(axis=1)
         expected += run.noise * (run.right**2).sum(axis=1).mean()
     for half in (slice(0, 200), slice(200, 400)):
@@ -259,7 +257,7 @@ def test_the_noise_of_rows_is_known():
 
 def test_without_noise_nothing_is_smoothed():
     rows = np.random.default_rng(0).random((30, 20)).astype(np.float32)
-    found = smoothed(factored(rows, np.zeros_like(rows)), smoothing(30))
+    found = smooth_rows(denoise_rows(rows, np.zeros_like(rows)), smoothing(30))
     assert np.array_equal(found.matrix(), rows)
 
 
@@ -269,17 +267,16 @@ def test_smoothing_rows_some_of_which_have_no_noise():
     clean[40:80] = 0
     deviation = np.ones((120, 1))
     deviation[40:80] = 0
-    found = smoothed(factored(*noisy(clean, deviation)), smoothing(120))
+    found = smooth_rows(denoise_rows(*noisy(clean, deviation)), smoothing(120))
     assert np.isfinite(found.matrix()).all()
     assert np.abs(found.matrix()[45:75]).max() < 1e-2 * np.abs(clean).max()
 
 
-def test_many_values_above_the_noise_are_found_exactly(monkeypatch):
+def test_many_values_above_the_noise_are_found_exactly():
     """The sketch gives up when it is full."""
     rows, variance = noisy(truth(600, 300, 3), 1.0)
-    sketched = factored(rows, variance)
-    monkeypatch.setattr(denoising, "SKETCH", R)
-    exact = factored(rows, variance)
+    sketched = denoise_rows(rows, variance)
+    exact = denoise_rows(rows, variance, DenoisingOptions(sketch=R))
     assert sketched.rank >= R
     assert exact.rank >= sketched.rank
     assert error(sketched.matrix(), exact.matrix()) < 1e-2 * np.linalg.norm(exact.matrix())

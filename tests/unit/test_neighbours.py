@@ -123,9 +123,9 @@ def test_what_is_not_finite_is_named():
     bad[2, 1] = np.nan
     with pytest.raises(PrtError, match="^vertex 2 has the position .*nan.*: repair the mesh$"):
         radius_neighbours(bad, good, 1)
-    with pytest.raises(PrtError, match="^dense vertex 2 has the position"):
+    with pytest.raises(PrtError, match="^candidate 2 has the position"):
         radius_neighbours(good, bad, 1)
-    with pytest.raises(PrtError, match="^dense vertex 2 has the normal"):
+    with pytest.raises(PrtError, match="^candidate 2 has the normal"):
         surface_neighbours(good, good, good, bad, 3)
     for radius in (-1, np.nan):
         with pytest.raises(PrtError, match="radius is"):

@@ -5,11 +5,11 @@ import pytest
 from conftest import COLOURS, build, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.reconstruction import node_placement as nodes_module
-from mi_sparse_prt.reconstruction.node_placement import choose_nodes
+from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.reconstruction import node_placement
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 
 @pytest.fixture(scope="module")
@@ -17,9 +17,9 @@ def scene() -> Scene:
     return build(0.12, **still_life(COLOURS))
 
 
-@pytest.fixture(autouse=True)
-def _few(monkeypatch) -> None:
-    monkeypatch.setattr(nodes_module, "SMALL", 200)
+def choose_nodes(scene: Scene, points: Points, most: int) -> Nodes:
+    """Meshes of more than 200 vertices have fewer nodes."""
+    return node_placement.choose_nodes(scene, points, most, small=200)
 
 
 def test_small_meshes_keep_all_vertices(scene):

@@ -19,7 +19,7 @@ from mi_sparse_prt.benchmark.neighbour_radius import (
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
-from mi_sparse_prt.sampling.features import best_features
+from mi_sparse_prt.sampling.features import choose_features
 
 RESOLUTION, DIRECTIONS, VERTICES = 8, 60, 20
 
@@ -67,7 +67,7 @@ def test_errors_are_those_of_vertices_one_at_a_time(scene: prt.Scene, report: di
         rows = samples.dense[near[0]]
         full = np.linalg.lstsq(rows.T.astype(float), exact.astype(float), rcond=None)[0]
         squared["full"] += float(((full @ rows - exact) ** 2).sum())
-        chosen = best_features(near, samples.dense, samples.features, DIRECTIONS)
+        chosen = choose_features(near, samples.dense, samples.features, DIRECTIONS)
         chosen = chosen[chosen >= 0][None]
         weights = l1_fit(*normal_equations(samples.dense, near, chosen, exact[chosen])).weights[0]
         squared["l1"] += float(((weights @ rows - exact) ** 2).sum())

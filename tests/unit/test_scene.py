@@ -11,7 +11,10 @@ import pytest
 
 import mi_sparse_prt  # noqa: F401  chooses the variant
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
-from mi_sparse_prt.scene.scene import Scene, load_scene
+from mi_sparse_prt.scene.loading import load_scene
+from mi_sparse_prt.scene.mesh_cleaning import check_geometry
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 T = mi.ScalarTransform4f
 INF = float("inf")
@@ -586,13 +589,11 @@ def test_normals_of_the_file_are_kept(tmp_path: Path) -> None:
 
 
 def test_indices_out_of_range_are_refused(tmp_path: Path) -> None:
-    from mi_sparse_prt.scene import tessellation
-
     # Loading such a file may already crash Mitsuba's BVH: the check itself is tested, not the loader.
     positions = np.array(SQUARE, np.float32)
-    mesh = tessellation.TriangleMesh("part", positions, None, np.array([[0, 1, 9]], np.int32))
+    mesh = TriangleMesh("part", positions, None, np.array([[0, 1, 9]], np.int32))
     with pytest.raises(PrtError, match="shape 'part': triangle 0 refers to a vertex outside 0..3"):
-        tessellation.check_geometry(mesh)
+        check_geometry(mesh)
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,11 @@ from scipy.stats import chisquare
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.sampling.spatial import (
-    ENERGY,
-    ROUNDING,
-    SHARING,
+    SpatialSampling,
     choose_dense,
+    choose_weighted,
     local_rank,
     local_ranks_at,
-    weighted_choice,
 )
 
 
@@ -33,7 +31,7 @@ def svd_rank(rows: np.ndarray) -> int:
     if not rows.any():
         return 0
     energy = np.linalg.svd(rows.astype(float), compute_uv=False) ** 2
-    return int(np.searchsorted(np.cumsum(energy), (ENERGY - ROUNDING) * energy.sum()) + 1)
+    return int(np.searchsorted(np.cumsum(energy), (0.99 - 1e-9) * energy.sum()) + 1)
 
 
 def grid(side: int) -> np.ndarray:
@@ -122,7 +120,7 @@ def test_ranks_are_those_of_the_dense_rows_within_the_radius():
 
 def test_single_draws_are_in_proportion_to_the_weights():
     weights, keys = np.array([1.0, 2, 3, 4]), np.arange(4, dtype=np.uint64)
-    drawn = [int(weighted_choice(weights, keys, 1, seed)[0]) for seed in range(4000)]
+    drawn = [int(choose_weighted(weights, keys, 1, seed)[0]) for seed in range(4000)]
     assert chisquare(np.bincount(drawn), 4000 * weights / weights.sum()).pvalue > 1e-3
 
 
@@ -136,14 +134,14 @@ def test_draws_without_replacement_have_their_probabilities():
         + weights[j] / total * weights[i] / (total - weights[j])
         for i, j in pairs
     ]
-    drawn = [pairs.index(tuple(weighted_choice(weights, keys, 2, seed))) for seed in range(6000)]
+    drawn = [pairs.index(tuple(choose_weighted(weights, keys, 2, seed))) for seed in range(6000)]
     assert chisquare(np.bincount(drawn, minlength=6), 6000 * np.array(p)).pvalue > 1e-3
 
 
 def test_keys_draw_independently():
     """One seed, many keys: within four standard errors of an even draw, in every corner of the keys."""
     n, count = 20000, 5000
-    chosen = weighted_choice(np.ones(n), np.arange(n, dtype=np.uint64), count, 3)
+    chosen = choose_weighted(np.ones(n), np.arange(n, dtype=np.uint64), count, 3)
     share = np.bincount(chosen // 2000, minlength=10) / 2000
     assert np.abs(share - 0.25).max() < 4 * np.sqrt(0.25 * 0.75 / 2000)
 
@@ -158,11 +156,11 @@ def test_keys_draw_independently():
 def test_choice_in_any_order(weights, count, seed, random):
     n = len(weights)
     keys = mix(np.arange(n, dtype=np.uint64))
-    chosen = weighted_choice(weights, keys, count, seed)
+    chosen = choose_weighted(weights, keys, count, seed)
     assert len(chosen) == len(set(chosen)) == min(max(count, 0), n)
     assert (np.diff(chosen) > 0).all()
     order = np.array(random.sample(range(n), n), int)
-    again = weighted_choice(weights[order], keys[order], count, seed)
+    again = choose_weighted(weights[order], keys[order], count, seed)
     assert np.array_equal(np.sort(keys[chosen]), np.sort(keys[order][again]))
     # weight 0 only when nothing else is left
     assert (weights[chosen] > 0).sum() == min(len(chosen), (weights > 0).sum())
@@ -170,14 +168,14 @@ def test_choice_in_any_order(weights, count, seed, random):
 
 def test_zero_weights_are_drawn_at_random():
     keys = np.arange(3, dtype=np.uint64)
-    drawn = [int(weighted_choice(np.zeros(3), keys, 1, seed)[0]) for seed in range(3000)]
+    drawn = [int(choose_weighted(np.zeros(3), keys, 1, seed)[0]) for seed in range(3000)]
     assert chisquare(np.bincount(drawn, minlength=3)).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("bad", [-1, np.nan, np.inf])
 def test_impossible_weights(bad):
     with pytest.raises(PrtError, match="vertex 1 has the weight"):
-        weighted_choice(np.array([1, bad]), np.arange(2, dtype=np.uint64), 1, 0)
+        choose_weighted(np.array([1, bad]), np.arange(2, dtype=np.uint64), 1, 0)
 
 
 # --- Choice of dense vertices -----------------------------------------------------------------------------------------
@@ -197,7 +195,7 @@ class Asked:
 def test_iterations_add_up():
     p = grid(20)
     asked = Asked(packed(edges(p)))
-    samples = choose_dense(p, hash_rows(p), asked, 0.22, step=0.05)
+    samples = choose_dense(p, hash_rows(p), asked, SpatialSampling(0.22, step=0.05, sharing=5))
     assert [len(ids) for ids in samples.iterations] == [20, 20, 20, 20, 8]
     assert np.array_equal(samples.ids, np.sort(np.concatenate(samples.iterations)))
     assert len(set(samples.ids)) == 88
@@ -205,7 +203,7 @@ def test_iterations_add_up():
     assert [sorted(ids) for ids in asked.calls] == [ids.tolist() for ids in samples.iterations]
     assert samples.ranks.shape == (400,) and (samples.ranks >= 1).all()
     before, first = np.concatenate(samples.iterations[:-1]), samples.iterations[0]
-    first = first[np.argsort(hash_rows(p)[first])][::SHARING]  # centres of local matrices
+    first = first[np.argsort(hash_rows(p)[first])][::5]  # centres of local matrices
     owner = np.argmin(np.linalg.norm(p[:, None] - p[first], axis=2), axis=1)
     apart = np.sort(np.linalg.norm(p[:, None] - p[first], axis=2), axis=1)
     clear = apart[:, 1] - apart[:, 0] > 1e-6  # of equally near ones either may be taken
@@ -223,9 +221,9 @@ def test_order_of_vertices_does_not_show():
     bits[: len(p) // 2] = bits[0]
     order = rng.permutation(len(p))
     # so few neighbours that a local matrix often has only one side of a seam
-    shared = {"fraction": 0.5, "step": 0.1, "seed": 5, "k": 2}
-    a = choose_dense(p, keys, lambda ids: bits[ids], **shared)
-    b = choose_dense(p[order], keys[order], lambda ids: bits[order][ids], **shared)
+    shared = SpatialSampling(0.5, step=0.1, rows=2), 5
+    a = choose_dense(p, keys, lambda ids: bits[ids], *shared)
+    b = choose_dense(p[order], keys[order], lambda ids: bits[order][ids], *shared)
     assert np.array_equal(np.sort(keys[a.ids]), np.sort(keys[order][b.ids]))
     assert np.array_equal(a.ranks[order], b.ranks)
     for one, other in zip(a.iterations, b.iterations, strict=True):
@@ -235,7 +233,9 @@ def test_order_of_vertices_does_not_show():
 def test_seeds_differ():
     p = grid(20)
     bits = packed(edges(p))
-    a, b = (choose_dense(p, hash_rows(p), lambda i: bits[i], 0.2, seed=seed).ids for seed in (0, 1))
+    a, b = (
+        choose_dense(p, hash_rows(p), lambda i: bits[i], SpatialSampling(0.2), seed).ids for seed in (0, 1)
+    )
     assert not np.array_equal(a, b)
 
 
@@ -245,7 +245,7 @@ def test_complex_places_get_more_vertices():
     noisy = p[:, 0] > 0.5
     bits = np.random.default_rng(0).integers(0, 1 << 32, (len(p), 8), dtype=np.uint32)
     bits[~noisy] = 0xFFFFFFFF
-    samples = choose_dense(p, hash_rows(p), lambda ids: bits[ids], 0.25, radius=0.15)
+    samples = choose_dense(p, hash_rows(p), lambda ids: bits[ids], SpatialSampling(0.25, radius=0.15))
     first, later = samples.iterations[0], np.concatenate(samples.iterations[1:])
     assert abs(noisy[first].mean() - 0.5) < 4 * np.sqrt(0.25 / len(first))
     assert noisy[later].sum() > 3 * (~noisy[later]).sum()
@@ -254,23 +254,9 @@ def test_complex_places_get_more_vertices():
 
 def test_where_nothing_is_seen_vertices_are_still_chosen():
     p = grid(10)
-    samples = choose_dense(p, hash_rows(p), lambda ids: np.zeros((len(ids), 3), np.uint32), 0.3)
+    dark = np.zeros((len(p), 3), np.uint32)
+    samples = choose_dense(p, hash_rows(p), lambda ids: dark[ids], SpatialSampling(0.3))
     assert len(samples.ids) == 30 and (samples.ranks == 0).all()
-
-
-def test_choice_can_stop_early():
-    p = grid(20)
-    seen = []
-
-    def stop(samples):
-        seen.append(samples)
-        return len(seen) == 3
-
-    bits = packed(edges(p))
-    samples = choose_dense(p, hash_rows(p), lambda ids: bits[ids], 1, stop=stop)
-    assert samples is seen[-1]
-    assert [len(s.ids) for s in seen] == [20, 40, 60]
-    assert [len(s.iterations) for s in seen] == [1, 2, 3]
 
 
 @pytest.mark.parametrize("n, expected", [(0, 0), (1, 1), (2, 2), (3, 2), (39, 2), (100, 10)])
@@ -278,7 +264,8 @@ def test_small_meshes(n, expected):
     p = np.zeros((n, 3), np.float32)  # a mesh without size has a radius of 0
     p[:, 0] = np.arange(n) if n < 50 else 0
     keys = mix(np.arange(n, dtype=np.uint64))
-    samples = choose_dense(p, keys, lambda ids: np.ones((len(ids), 1), np.uint32), 0.1 if n > 39 else 0.05)
+    sampling = SpatialSampling(0.1 if n > 39 else 0.05)
+    samples = choose_dense(p, keys, lambda ids: np.ones((len(ids), 1), np.uint32), sampling)
     assert len(samples.ids) == expected
     drawn_by_rank = len(samples.iterations) > 1
     assert (samples.ranks == drawn_by_rank).all() and samples.ranks.shape == (n,)
@@ -286,28 +273,26 @@ def test_small_meshes(n, expected):
 
 def test_every_vertex():
     p = grid(6)
-    samples = choose_dense(p, hash_rows(p), lambda ids: np.ones((len(ids), 1), np.uint32), 1, step=0.4)
+    lit = np.ones((len(p), 1), np.uint32)
+    samples = choose_dense(p, hash_rows(p), lambda ids: lit[ids], SpatialSampling(1, step=0.4))
     assert np.array_equal(samples.ids, np.arange(36))
 
 
 def test_impossible_choices():
     p = grid(4)
 
-    def choose(**parameters):
-        return choose_dense(
-            **{"positions": p, "fraction": 0.5, **parameters}, keys=hash_rows(p), visibility=ones
-        )
-
-    def ones(ids):
-        return np.ones((len(ids), 1), np.uint32)
+    def choose(positions, **parameters):
+        ones = np.ones((len(positions), 1), np.uint32)
+        sampling = SpatialSampling(**{"fraction": 0.5, **parameters})
+        return choose_dense(positions, hash_rows(p), lambda ids: ones[ids], sampling)
 
     for name in ("fraction", "step"):
         for value in (0, 1.5, -1, np.nan):
             with pytest.raises(PrtError, match=f"{name} is {value}"):
-                choose(**{name: value})
+                choose(p, **{name: value})
     broken = p.copy()
     broken[5] = np.nan
     with pytest.raises(PrtError, match="^vertex 5 has the position"):
-        choose(positions=broken)
+        choose(broken)
     with pytest.raises(PrtError, match="radius is -1"):
-        choose(radius=-1)
+        choose(p, radius=-1)

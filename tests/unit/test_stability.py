@@ -9,17 +9,19 @@ import pytest
 from conftest import build, diffuse, mesh, still_life
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from interior_point import interior_point_fit
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark.least_squares import least_squares_fit
 from mi_sparse_prt.core.bits import pack, unpack
 from mi_sparse_prt.measurement.neighbours import Neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.reconstruction.denoising import denoised
+from mi_sparse_prt.reconstruction.denoising import denoise_rows
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
-from mi_sparse_prt.reconstruction.l1 import l1_fit, least_squares_fit
+from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
-from mi_sparse_prt.sampling.features import best_features, contested, copy_agreed
+from mi_sparse_prt.sampling.features import choose_features, copy_agreed, find_contested
 from mi_sparse_prt.sampling.spatial import local_rank
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -84,8 +86,8 @@ def test_weights_are_worth_having(system, relative_lambda, single, interior):
         if any(np.abs(x).max() > 1e37 for x in products):
             return
         products = tuple(x.astype(np.float32) for x in products)
-    solver = "interior_point" if interior and relative_lambda > 0 else "coordinate_descent"
-    fit = l1_fit(*products, relative_lambda, solver)
+    interior &= relative_lambda > 0
+    fit = (interior_point_fit if interior else l1_fit)(*products, relative_lambda)
     for i in range(len(values)):
         asked, there = directions[i] >= 0, neighbours[i] >= 0
         a = fit.weights[i][there]
@@ -98,7 +100,7 @@ def test_weights_are_worth_having(system, relative_lambda, single, interior):
         assert penalty * np.abs(a).sum() <= 1.001 * scale
         if not single:
             assert objective(a, A, y, penalty) <= (1 + 1e-5) * scale
-        if scale == 0 or relative_lambda >= 1 and solver == "coordinate_descent" and not single:
+        if scale == 0 or relative_lambda >= 1 and not interior and not single:
             assert not a.any()
 
 
@@ -136,11 +138,11 @@ def test_denoised_rows_stay_bounded(kind, shape):
     rng = np.random.default_rng(0)
     rows = dense_rows(kind, shape[0], rng)
     variance = np.full_like(rows, max(float(rows.mean()) ** 2 / 10, 1e-30))
-    ours = denoised(rows, variance).matrix()
+    ours = denoise_rows(rows, variance).matrix()
     assert np.isfinite(ours).all()
     assert np.linalg.norm(ours.astype(float)) <= 1.001 * np.linalg.norm(rows.astype(float))
     uneven = (rows.astype(np.float64) ** 2 * 10.0 ** rng.uniform(-6, 0, rows.shape)).astype(np.float32)
-    assert np.isfinite(denoised(rows, uneven).matrix()).all()
+    assert np.isfinite(denoise_rows(rows, uneven).matrix()).all()
 
 
 @settings(deadline=None, max_examples=60)
@@ -183,7 +185,7 @@ def test_features_of_any_rows(seed, kind, count):
     rows = dense_rows(kind, 6, rng)
     features = rng.random(rows.shape) < 0.3
     near = np.array([[0, -1, -1], [0, 1, 2], [3, 4, 5], [-1, -1, -1]], np.int32)
-    chosen = best_features(near, rows, pack(features), count)
+    chosen = choose_features(near, rows, pack(features), count)
     for row, ids in zip(chosen, near, strict=True):
         taken = row[row >= 0]
         assert (np.diff(taken) > 0).all()
@@ -197,7 +199,7 @@ def test_rows_that_are_all_equal_are_not_contested(value):
     seen, everywhere = np.full((5, WIDTH), value), np.ones((5, WIDTH), bool)
     near = np.tile(np.arange(5, dtype=np.int32), (3, 1))
     dense, own, agreed = pack(everywhere), pack(everywhere[:3]), pack(~everywhere[:3])
-    differ = contested(near, pack(seen), dense, np.arange(3), own, np.zeros_like(own))
+    differ = find_contested(near, pack(seen), dense, np.arange(3), own, np.zeros_like(own))
     copy_agreed(near, pack(seen), dense, np.arange(3), own, agreed)
     assert not differ.any()
     assert (unpack(agreed, WIDTH) == value).all()

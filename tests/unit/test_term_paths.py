@@ -11,7 +11,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.reflection.factor_tables import table_directions
-from mi_sparse_prt.reflection.frames import frames, orthogonal
+from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.term_paths import TermPaths
@@ -51,7 +51,7 @@ def part_of(
     tables = np.stack([f(table_directions()).reshape(128, 128, 2) for f in functions])
     along = np.random.default_rng(3).normal(size=(len(glossy), 3)).astype(np.float32)
     normals = scene.normals[glossy]
-    turn = frames(orthogonal(along, normals), normals)
+    turn = frames(orthogonalise(along, normals), normals)
     bits = np.zeros((scene.n_vertices, lighting.n_directions // 32), np.uint32)
     return FactoredVisibility(
         bits, scene.normals, lighting, glossy, turn, materials, tables.astype(np.float32)

@@ -1,5 +1,7 @@
 """Triangles from shapes: grids of parametric surfaces, cleaning, subdivision."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -8,24 +10,37 @@ from hypothesis import strategies as st
 
 import mi_sparse_prt  # noqa: F401  chooses the variant
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene import tessellation as ts
+from mi_sparse_prt.scene.mesh_cleaning import (
+    angle_weighted_normals,
+    check_geometry,
+    drop_degenerate,
+    drop_unreferenced,
+    faces_inwards,
+    flip_sides,
+    make_unit_normals,
+    split_by_face,
+    stabilise_normals,
+)
+from mi_sparse_prt.scene.parametric_shapes import parametric_mesh
+from mi_sparse_prt.scene.subdivision import TIE, subdivide
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, triangle_normals
 
 T = mi.ScalarTransform4f
 LIMIT = 100_000
 
 
-def tetrahedron(flip: bool = False) -> ts.TriangleMesh:
+def tetrahedron(flip: bool = False) -> TriangleMesh:
     """A closed mesh with outward faces and outward vertex normals."""
     p = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float32)
     t = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32)
-    mesh = ts.TriangleMesh("tetrahedron", p, p / np.float32(np.sqrt(3)), t)
-    return ts.flipped(mesh) if flip else mesh
+    mesh = TriangleMesh("tetrahedron", p, p / np.float32(np.sqrt(3)), t)
+    return flip_sides(mesh) if flip else mesh
 
 
-def square() -> ts.TriangleMesh:
+def square() -> TriangleMesh:
     """The unit square in z = 0 with texture coordinates and attributes."""
     p = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
-    return ts.TriangleMesh(
+    return TriangleMesh(
         "square",
         p,
         np.tile(np.float32([0, 0, 1]), (4, 1)),
@@ -36,16 +51,16 @@ def square() -> ts.TriangleMesh:
     )
 
 
-def area(mesh: ts.TriangleMesh) -> float:
-    return float(np.linalg.norm(ts.triangle_normals(mesh), axis=1).sum() / 2)
+def area(mesh: TriangleMesh) -> float:
+    return float(np.linalg.norm(triangle_normals(mesh), axis=1).sum() / 2)
 
 
-def volume(mesh: ts.TriangleMesh) -> float:
+def volume(mesh: TriangleMesh) -> float:
     p = mesh.positions.astype(np.float64)[mesh.triangles]
     return float(np.einsum("ij,ij->", p[:, 0], np.cross(p[:, 1], p[:, 2])) / 6)
 
 
-def welded_edge_counts(mesh: ts.TriangleMesh) -> np.ndarray:
+def welded_edge_counts(mesh: TriangleMesh) -> np.ndarray:
     """How many triangles share each edge, vertices welded by position."""
     _, weld = np.unique(mesh.positions, axis=0, return_inverse=True)
     t = weld.reshape(-1)[mesh.triangles]
@@ -53,7 +68,7 @@ def welded_edge_counts(mesh: ts.TriangleMesh) -> np.ndarray:
     return np.unique(edges, axis=0, return_counts=True)[1]
 
 
-def longest_edge(mesh: ts.TriangleMesh) -> float:
+def longest_edge(mesh: TriangleMesh) -> float:
     p = mesh.positions.astype(np.float64)[mesh.triangles]
     return float(np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2).max())
 
@@ -95,7 +110,7 @@ def test_grid_lies_on_mitsubas_own_surface(shape: str, scale: list[float], flip:
     np.testing.assert_allclose(np.array(si.sh_frame.n).T, n, atol=3e-6)
     np.testing.assert_allclose(np.array(si.uv).T, uv, atol=3e-5)
     # and triangles face the way that their normals point
-    facing = np.einsum("ij,ikj->ik", ts.triangle_normals(mesh), mesh.normals[mesh.triangles])
+    facing = np.einsum("ij,ikj->ik", triangle_normals(mesh), mesh.normals[mesh.triangles])
     assert facing.min() > 0
 
 
@@ -104,10 +119,10 @@ def test_grid_lies_on_mitsubas_own_surface(shape: str, scale: list[float], flip:
     ("shape", "exact"), [("sphere", 4 * np.pi), ("disk", np.pi), ("cylinder", 2 * np.pi)]
 )
 def test_grid_has_the_surfaces_area_and_no_empty_triangle(shape: str, exact: float, weld: bool) -> None:
-    mesh = ts.parametric_mesh(shape, np.eye(4), 0.05, shape, limit=LIMIT, weld=weld)
+    mesh = parametric_mesh(shape, np.eye(4), 0.05, shape, limit=LIMIT, weld=weld)
     assert exact * (1 - 2e-3) < area(mesh) < exact  # inscribed
-    assert ts.drop_degenerate(mesh)[1] == 0
-    assert ts.drop_unreferenced(mesh)[1] == 0
+    assert drop_degenerate(mesh)[1] == 0
+    assert drop_unreferenced(mesh)[1] == 0
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
     counts = welded_edge_counts(mesh)
     assert set(counts) == ({2} if shape == "sphere" else {1, 2})
@@ -118,14 +133,14 @@ def test_grid_has_the_surfaces_area_and_no_empty_triangle(shape: str, exact: flo
 
 
 def test_grid_lines_are_no_further_apart_than_asked() -> None:
-    mesh = ts.parametric_mesh("sphere", np.diag([3.0, 3, 3, 1]), 0.25, "s", limit=LIMIT, weld=True)
-    assert longest_edge(mesh) <= 0.25 * np.sqrt(2) * (1 + ts.TIE)  # the cells' diagonals
-    coarse = ts.parametric_mesh("sphere", np.eye(4), np.inf, "s", limit=LIMIT)
+    mesh = parametric_mesh("sphere", np.diag([3.0, 3, 3, 1]), 0.25, "s", limit=LIMIT, weld=True)
+    assert longest_edge(mesh) <= 0.25 * np.sqrt(2) * (1 + TIE)  # the cells' diagonals
+    coarse = parametric_mesh("sphere", np.eye(4), np.inf, "s", limit=LIMIT)
     assert len(coarse.positions) < 700
 
 
 def test_poles_have_texture_coordinates_of_their_own_cells() -> None:
-    mesh = ts.parametric_mesh("sphere", np.eye(4), 0.5, "s", limit=LIMIT)
+    mesh = parametric_mesh("sphere", np.eye(4), 0.5, "s", limit=LIMIT)
     u = mesh.texcoords[mesh.triangles][..., 0]
     assert np.ptp(u, axis=1).max() < 0.05  # no triangle spans the seam or the circle around a pole
 
@@ -135,18 +150,18 @@ def test_grid_refuses_shear_and_excess() -> None:
     shear[0, 1] = 0.3
     for shape in ("sphere", "cylinder"):
         with pytest.raises(PrtError, match=r"'odd'.*must not shear.*use a mesh"):
-            ts.parametric_mesh(shape, shear, 0.1, "odd", limit=LIMIT)
-    ts.parametric_mesh("disk", shear, 0.1, "odd", limit=LIMIT)  # Mitsuba's disk may be sheared
+            parametric_mesh(shape, shear, 0.1, "odd", limit=LIMIT)
+    parametric_mesh("disk", shear, 0.1, "odd", limit=LIMIT)  # Mitsuba's disk may be sheared
     with pytest.raises(PrtError, match=r"'s'.*more than 1000 vertices.*larger edge_length"):
-        ts.parametric_mesh("sphere", np.eye(4), 0.01, "s", limit=1000)
+        parametric_mesh("sphere", np.eye(4), 0.01, "s", limit=1000)
 
 
 # ------------------------------------------------------------------------------------------ subdivision
 
 
 def test_subdivision_interpolates_positions_texture_and_attributes() -> None:
-    mesh = ts.subdivide(square(), 0.1, LIMIT)
-    assert longest_edge(mesh) <= 0.1 * (1 + ts.TIE)
+    mesh = subdivide(square(), 0.1, LIMIT)
+    assert longest_edge(mesh) <= 0.1 * (1 + TIE)
     assert area(mesh) == pytest.approx(1, abs=1e-6)
     np.testing.assert_array_equal(mesh.positions[:4], square().positions)  # the old vertices come first
     np.testing.assert_allclose(mesh.texcoords, mesh.positions[:, :2] * [2, 3], atol=1e-6)
@@ -154,21 +169,21 @@ def test_subdivision_interpolates_positions_texture_and_attributes() -> None:
     centre = mesh.positions[mesh.triangles].mean(axis=1)
     below = centre[:, 1] < centre[:, 0]  # the square's first triangle
     np.testing.assert_array_equal(mesh.face_attributes["face_id"][:, 0], np.where(below, 1, 2))
-    assert np.all(ts.triangle_normals(mesh)[:, 2] > 0)
+    assert np.all(triangle_normals(mesh)[:, 2] > 0)
 
 
 def test_subdivision_with_infinite_length_changes_nothing() -> None:
     mesh = square()
-    assert ts.subdivide(mesh, np.inf, LIMIT) is mesh
+    assert subdivide(mesh, np.inf, LIMIT) is mesh
 
 
 def test_subdivision_stops_at_the_limit() -> None:
     with pytest.raises(PrtError, match=r"'square'.*more than 500 vertices.*larger edge_length"):
-        ts.subdivide(square(), 0.01, 500)
+        subdivide(square(), 0.01, 500)
 
 
 def test_subdivided_normals_are_unit_and_between_their_neighbours() -> None:
-    mesh = ts.subdivide(tetrahedron(), 0.3, LIMIT)
+    mesh = subdivide(tetrahedron(), 0.3, LIMIT)
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
     edge_midpoint = np.flatnonzero(np.all(mesh.positions == [1, 0, 0], axis=1))  # between vertices 0 and 1
     np.testing.assert_allclose(mesh.normals[edge_midpoint], [[1, 0, 0]], atol=1e-6)
@@ -176,9 +191,9 @@ def test_subdivided_normals_are_unit_and_between_their_neighbours() -> None:
 
 def test_subdivision_leaves_no_crack_between_faces_that_share_no_vertex() -> None:
     # Faces split apart (facets): both sides of an edge must split at the same points, bit by bit.
-    facets = ts.split_by_face(tetrahedron())
+    facets = split_by_face(tetrahedron())
     assert len(facets.positions) == 12
-    fine = ts.subdivide(facets, 0.37, LIMIT)
+    fine = subdivide(facets, 0.37, LIMIT)
     assert set(welded_edge_counts(fine)) == {2}
     assert volume(fine) == pytest.approx(volume(tetrahedron()), rel=1e-6)
 
@@ -194,8 +209,8 @@ def test_subdivision_of_any_tetrahedron_is_conforming(corners: list, share: floa
     if abs(volume(mesh)) < 1e-3:
         return
     length = share * longest_edge(mesh)
-    fine = ts.subdivide(mesh, length, LIMIT)
-    assert longest_edge(fine) <= length * (1 + ts.TIE)
+    fine = subdivide(mesh, length, LIMIT)
+    assert longest_edge(fine) <= length * (1 + TIE)
     assert set(welded_edge_counts(fine)) == {2}
     assert area(fine) == pytest.approx(area(mesh), rel=1e-5)
     # new vertices are rounded to float32, which moves a flat tetrahedron's faces by a share of its size
@@ -213,10 +228,10 @@ def test_triangles_without_area_and_unused_vertices_are_dropped() -> None:
     mesh.texcoords, mesh.vertex_attributes = None, {}
     mesh.triangles = np.array([[0, 1, 2], [0, 0, 1], [0, 1, 5], [0, 2, 3]], np.int32)
     mesh.face_attributes = {"face_id": np.arange(4, dtype=np.float32)[:, None]}
-    clean, dropped = ts.drop_degenerate(mesh)
+    clean, dropped = drop_degenerate(mesh)
     assert dropped == 2
     np.testing.assert_array_equal(clean.face_attributes["face_id"][:, 0], [0, 3])
-    clean, unused = ts.drop_unreferenced(clean)
+    clean, unused = drop_unreferenced(clean)
     assert unused == 2
     np.testing.assert_array_equal(clean.positions[clean.triangles], square().positions[square().triangles])
 
@@ -224,10 +239,8 @@ def test_triangles_without_area_and_unused_vertices_are_dropped() -> None:
 def test_thin_but_real_triangles_are_kept_at_any_scale() -> None:
     thin = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-4, 0]])
     for scale in (1e-6, 1.0, 1e6):
-        mesh = ts.TriangleMesh(
-            "thin", (thin * scale).astype(np.float32), None, np.array([[0, 1, 2]], np.int32)
-        )
-        assert ts.drop_degenerate(mesh)[1] == 0
+        mesh = TriangleMesh("thin", (thin * scale).astype(np.float32), None, np.array([[0, 1, 2]], np.int32))
+        assert drop_degenerate(mesh)[1] == 0
 
 
 def test_bad_geometry_names_shape_and_vertex() -> None:
@@ -235,18 +248,18 @@ def test_bad_geometry_names_shape_and_vertex() -> None:
     mesh.positions = mesh.positions.copy()
     mesh.positions[2, 1] = np.nan
     with pytest.raises(PrtError, match=r"shape 'square': vertex 2 has a position that is not finite"):
-        ts.check_geometry(mesh)
+        check_geometry(mesh)
     mesh = square()
     mesh.triangles = np.array([[0, 1, 2], [0, 2, 4]], np.int32)
     with pytest.raises(PrtError, match=r"shape 'square': triangle 1 refers to a vertex outside 0..3"):
-        ts.check_geometry(mesh)
+        check_geometry(mesh)
 
 
 def test_facets_have_one_normal_per_vertex_and_share_what_is_flat() -> None:
-    flat = ts.split_by_face(square())
+    flat = split_by_face(square())
     assert len(flat.positions) == 4
-    facets = ts.split_by_face(tetrahedron())
-    faces = ts.triangle_normals(facets)
+    facets = split_by_face(tetrahedron())
+    faces = triangle_normals(facets)
     faces /= np.linalg.norm(faces, axis=1, keepdims=True)
     np.testing.assert_allclose(
         facets.normals[facets.triangles], np.repeat(faces[:, None], 3, axis=1), atol=1e-6
@@ -261,26 +274,26 @@ def test_angle_weighted_normals_do_not_depend_on_the_triangulation() -> None:
     p = np.array(cube.vertex_positions_buffer()).reshape(-1, 3)
     positions, index = np.unique(p, axis=0, return_inverse=True)
     triangles = index.reshape(-1)[np.array(cube.faces_buffer()).reshape(-1, 3)].astype(np.int32)
-    mesh = ts.TriangleMesh("cube", positions.astype(np.float32), None, triangles)
-    normals, cancellation = ts.angle_weighted_normals(mesh)
+    mesh = TriangleMesh("cube", positions.astype(np.float32), None, triangles)
+    normals, cancellation = angle_weighted_normals(mesh)
     np.testing.assert_allclose(normals, positions / np.sqrt(3), atol=1e-6)
     np.testing.assert_allclose(cancellation, np.sqrt(3), atol=1e-6)
 
 
 def test_normals_computed_by_the_loader_are_settled_and_others_kept() -> None:
     mesh = tetrahedron()
-    own, _ = ts.angle_weighted_normals(mesh)
+    own, _ = angle_weighted_normals(mesh)
     loaded = own + np.float32(2e-7) * np.sign(own)  # what a parallel sum may give
     recomputed = own.copy()
     loaded[1] = recomputed[1] = np.nan  # a corner of a triangle without area
     loaded[2] = [0, 1, 0]  # the file's own
-    settled = ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+    settled = stabilise_normals(replace(mesh, normals=loaded), recomputed)
     np.testing.assert_array_equal(settled.normals[[0, 1, 3]], own[[0, 1, 3]])
     np.testing.assert_array_equal(settled.normals[2], [0, 1, 0])
 
     loaded[3] = np.nan
     with pytest.raises(PrtError, match=r"'tetrahedron': vertex 3 has a normal that is zero or not finite"):
-        ts.settle_normals(ts.replace(mesh, normals=loaded), recomputed)
+        stabilise_normals(replace(mesh, normals=loaded), recomputed)
 
 
 def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
@@ -288,7 +301,7 @@ def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
     mesh.normals = mesh.normals.copy()
     mesh.normals[1] *= 3
     mesh.normals[2] = 0
-    unit, zero = ts.with_unit_normals(mesh)
+    unit, zero = make_unit_normals(mesh)
     assert zero == 1
     np.testing.assert_array_equal(unit.normals[[0, 3]], mesh.normals[[0, 3]])
     np.testing.assert_allclose(unit.normals, tetrahedron().normals, atol=1e-6)
@@ -297,14 +310,14 @@ def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
 @pytest.mark.parametrize("flip", [False, True])
 def test_closed_parts_that_face_inwards_are_found(flip: bool) -> None:
     mesh = tetrahedron(flip)
-    assert ts.faces_inwards(mesh) is flip
-    assert ts.faces_inwards(ts.split_by_face(mesh)) is flip  # welded by position
+    assert faces_inwards(mesh) is flip
+    assert faces_inwards(split_by_face(mesh)) is flip  # welded by position
     far = tetrahedron()
-    both = ts.TriangleMesh(
+    both = TriangleMesh(
         "both",
         np.concatenate([far.positions * 10 + 50, mesh.positions]),  # a large good part hides nothing
         np.concatenate([far.normals, mesh.normals]),
         np.concatenate([far.triangles, mesh.triangles + 4]),
     )
-    assert ts.faces_inwards(both) is flip
-    assert not ts.faces_inwards(mesh.take_triangles(np.arange(3)))  # an open part may face anywhere
+    assert faces_inwards(both) is flip
+    assert not faces_inwards(mesh.take_triangles(np.arange(3)))  # an open part may face anywhere

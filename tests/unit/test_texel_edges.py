@@ -102,7 +102,7 @@ def test_crossed_pairs_by_words_and_one_by_one(n):
     a, b = sides.tables.first, sides.tables.second
     slow = (a != b) & known[:, a] & known[:, b] & (seen[:, a] != seen[:, b])
     assert slow.any()
-    assert np.array_equal(unpack(sides.crossed(pack(seen), pack(known)), len(a)), slow)
+    assert np.array_equal(unpack(sides.find_crossed(pack(seen), pack(known)), len(a)), slow)
 
 
 # ------------------------------------------------------------------------------------ areas in a square
@@ -352,7 +352,7 @@ def test_rays_are_those_that_were_traced(grey_scene):
     part, rays = fractional_visibility(direct, bits)
     sides = TexelSides(direct.lighting)
     above = above_horizon(grey_scene.normals, direct.lighting.directions)
-    crossed = np.bitwise_count(sides.crossed(bits, above)).sum()
+    crossed = np.bitwise_count(sides.find_crossed(bits, above)).sum()
     assert rays == STEPS * crossed
     assert abs(direct.scene.traced - rays) <= STEPS  # and one lane more
     listed = Counter(np.repeat(np.arange(len(bits)), np.diff(part.starts)).tolist())

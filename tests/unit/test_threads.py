@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from mi_sparse_prt.core.block_products import MADE, rows_times
-from mi_sparse_prt.core.threads import overlapped
+from mi_sparse_prt.core.block_products import multiply_rows
+from mi_sparse_prt.core.threads import run_overlapped
 
 
 def test_results_come_in_the_order_of_their_tasks() -> None:
@@ -20,7 +20,7 @@ def test_results_come_in_the_order_of_their_tasks() -> None:
         time.sleep(0.02 * (i % 3 == 0))
         return i
 
-    assert list(overlapped(lambda i=i: late_first(i) for i in range(20))) == list(range(20))
+    assert list(run_overlapped(lambda i=i: late_first(i) for i in range(20))) == list(range(20))
 
 
 def test_tasks_run_beside_the_thread_that_prepares_the_next() -> None:
@@ -32,7 +32,7 @@ def test_tasks_run_beside_the_thread_that_prepares_the_next() -> None:
         second_is_made.set()
         yield lambda: True
 
-    assert list(overlapped(tasks())) == [True, True]
+    assert list(run_overlapped(tasks())) == [True, True]
 
 
 def test_an_error_in_a_task_is_raised_and_threads_are_given_back() -> None:
@@ -43,7 +43,7 @@ def test_an_error_in_a_task_is_raised_and_threads_are_given_back() -> None:
             yield lambda i=i: 1 // (i - 2)
 
     with pytest.raises(ZeroDivisionError):
-        list(overlapped(tasks()))
+        list(run_overlapped(tasks()))
     assert (numba.get_num_threads(), [p["num_threads"] for p in threadpool_info()]) == before
 
 
@@ -55,15 +55,15 @@ def test_products_and_kernels_use_one_thread_meanwhile() -> None:
         yield limits
         assert numba.get_num_threads() == 1
 
-    (found,) = overlapped(tasks())
+    (found,) = run_overlapped(tasks())
     assert found and set(found) == {1}
 
 
-@pytest.mark.parametrize("count", [0, 1, MADE, 2 * MADE + 3])
+@pytest.mark.parametrize("count", [0, 1, 16, 35])
 def test_rows_are_multiplied_in_their_order(count: int) -> None:
     rng = np.random.default_rng(0)
     rows, vectors = (rng.random(shape, np.float32) for shape in ((count, 20), (20, 3)))
-    found = rows_times(lambda ids: rows[ids][..., None], count, vectors)
+    found = multiply_rows(lambda ids: rows[ids][..., None], count, vectors, block=16)
     np.testing.assert_allclose(found[..., 0], rows @ vectors, rtol=1e-5)
 
 

@@ -172,7 +172,7 @@ def test_a_buried_vertex_is_reported():
 def test_rays_of_some_vertices(grey_scene):
     rays = vertex_rays(grey_scene.normalised)
     some = np.array([7, 3, 200])
-    chosen = rays.chosen(some)
+    chosen = rays.take(some)
     assert np.array_equal(chosen.origins, rays.origins[some])
     assert np.array_equal(chosen.directions, rays.directions[some])
     assert chosen.missed.shape == (3,)

@@ -4,10 +4,14 @@ All directions are in the local frame of a surface, +Z along its normal. The dif
 what is left, on a grid of directions; values between grid points are bilinear.
 """
 
-from mi_sparse_prt.reflection.brdf_factors.diffuse_part import anisotropic, diffuse_reflectance, evaluated
+from mi_sparse_prt.reflection.brdf_factors.diffuse_part import (
+    diffuse_reflectance,
+    evaluate_brdf,
+    is_anisotropic,
+)
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
-from mi_sparse_prt.reflection.brdf_factors.factor_cache import factors_of
-from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, factor_error
+from mi_sparse_prt.reflection.brdf_factors.factor_cache import FactorOptions, factors_of
+from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, measure_factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.reflection.brdf_factors.harmonics import harmonic_factors
 
@@ -16,11 +20,12 @@ __all__ = [
     "BrdfFactors",
     "DirectionGrid",
     "FactorError",
-    "anisotropic",
+    "FactorOptions",
+    "is_anisotropic",
     "diffuse_reflectance",
-    "evaluated",
+    "evaluate_brdf",
     "factor_brdf",
-    "factor_error",
+    "measure_factor_error",
     "factors_of",
     "harmonic_factors",
 ]

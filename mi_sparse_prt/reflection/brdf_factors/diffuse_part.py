@@ -9,22 +9,14 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import (
-    AZIMUTHS,
-    HEIGHTS,
     DirectionGrid,
     Doubles,
     Floats,
 )
-from mi_sparse_prt.scene.materials import kind
+from mi_sparse_prt.scene.materials import bsdf_class
 
-DARKEST = 0.05  # cosine of directions that tell the diffuse part: below, Fresnel terms have their say
-PLACES = 256  # texture coordinates at which a BSDF is looked at
-PROBES = 12  # outgoing directions for that, each with the mirrored, a nearby and another incident one
-LOWEST_PROBE = 0.3  # cosine
 SLANTED = (0.6, 0.0, 0.8)  # light that goes back where it came from: no highlight
 ROUNDING = 1e-5  # relative
-UNLIKE = 1e-2  # relative: what a turned BRDF differs by, tables and rounding apart
-TURNED = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]], np.float32)  # by 53 degrees
 
 
 class GlossyPart:
@@ -56,10 +48,10 @@ class GlossyPart:
     def __init__(self, bsdf: mi.BSDF, name: str) -> None:
         self._bsdf, self._name = bsdf, name
         self.varying_diffuse = _check(bsdf, name)
-        w = DirectionGrid(HEIGHTS // 4, AZIMUTHS // 4).directions
-        w = w[w[:, 2] > DARKEST]
+        w = DirectionGrid(16, 32).directions
+        w = w[w[:, 2] > 0.05]  # below, Fresnel terms have their say
         incident, outgoing = np.repeat(w, len(w), axis=0), np.tile(w, (len(w), 1))
-        value = evaluated(bsdf, name, incident, outgoing)
+        value = evaluate_brdf(bsdf, name, incident, outgoing)
         least = np.pi * (value / incident[:, 2:]).min(axis=0).astype(np.float64)
         coloured = value - incident[:, 2:] * least / np.pi if self.varying_diffuse else value
         grey = np.ptp(coloured, axis=1).max() <= 1e-6 * max(float(value.max()), 1e-30)
@@ -68,11 +60,11 @@ class GlossyPart:
 
     def values(self, incident: Floats, outgoing: Floats) -> Floats:
         """Glossy BRDF times the incident cosine, (m, channels), at pairs of directions (m, 3)."""
-        value = evaluated(self._bsdf, self._name, incident, outgoing)[:, : self.channels]
+        value = evaluate_brdf(self._bsdf, self._name, incident, outgoing)[:, : self.channels]
         cosine = np.where(outgoing[:, 2] > 0, np.maximum(incident[:, 2], 0), 0)
-        dull = cosine[:, None] * (self.diffuse[: self.channels] / np.pi).astype(np.float32)
-        part: Floats = value - dull
-        part[np.abs(part) <= ROUNDING * dull] = 0
+        lambertian = cosine[:, None] * (self.diffuse[: self.channels] / np.pi).astype(np.float32)
+        part: Floats = value - lambertian
+        part[np.abs(part) <= ROUNDING * lambertian] = 0
         return part
 
 
@@ -98,13 +90,13 @@ def diffuse_reflectance(bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f) -
     part = GlossyPart(bsdf, name)
     back = np.array([SLANTED], np.float32)
     here = np.broadcast_to(back, (dr.width(si), 3))
-    there = evaluated(bsdf, name, back, back)
-    change = _at(bsdf, name, mi.SurfaceInteraction3f(si), here, here) - there
+    there = evaluate_brdf(bsdf, name, back, back)
+    change = _evaluate_at(bsdf, name, mi.SurfaceInteraction3f(si), here, here) - there
     found: Floats = np.maximum(part.diffuse + change * (np.pi / SLANTED[2]), 0).astype(np.float32)
     return found
 
 
-def evaluated(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> Floats:
+def evaluate_brdf(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> Floats:
     """BRDF times the incident cosine, (m, 3), at pairs of directions (m, 3) in the local frame.
 
     Textures are looked at where their coordinates are (0, 0).
@@ -114,11 +106,13 @@ def evaluated(bsdf: mi.BSDF, name: str, incident: Floats, outgoing: Floats) -> F
     PrtError
         If a value is NaN or infinite.
     """
-    return _at(bsdf, name, dr.zeros(mi.SurfaceInteraction3f, len(incident)), incident, outgoing)
+    return _evaluate_at(bsdf, name, dr.zeros(mi.SurfaceInteraction3f, len(incident)), incident, outgoing)
 
 
-def _at(bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f, incident: Floats, outgoing: Floats) -> Floats:
-    """As `evaluated`, at places, whose directions are overwritten."""
+def _evaluate_at(
+    bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f, incident: Floats, outgoing: Floats
+) -> Floats:
+    """As `evaluate_brdf`, at places, whose directions are overwritten."""
     si.wi = mi.Vector3f(np.ascontiguousarray(outgoing.T))  # Mitsuba's wi is where the light leaves for
     light = mi.Vector3f(np.ascontiguousarray(incident.T))
     value = np.array(dr.zeros(mi.Color3f, len(incident)) + bsdf.eval(mi.BSDFContext(), si, light)).T
@@ -149,7 +143,7 @@ def _check(bsdf: mi.BSDF, name: str) -> bool:
             problem = "varies over the surface in more than a Lambertian reflectance"
     if problem:
         raise PrtError(
-            f"shape '{name}': BSDF {kind(bsdf)} {problem}, which factors of a BRDF cannot; "
+            f"shape '{name}': BSDF {bsdf_class(bsdf)} {problem}, which factors of a BRDF cannot; "
             "use path tracing instead"
         )
     return varies
@@ -159,40 +153,43 @@ def _variation(bsdf: mi.BSDF, name: str) -> tuple[bool, bool]:
     """Whether texture coordinates make a difference, which flags do not always tell, and if so, whether it is
     Lambertian: alike for all pairs of directions.
     """
-    incident, outgoing = probes()
-    uv = np.random.default_rng(0).random((2, PLACES), np.float32)
+    incident, outgoing = probe_directions()
+    places = 256  # texture coordinates
+    uv = np.random.default_rng(0).random((2, places), np.float32)
     uv[:, 0] = 0
-    si = dr.zeros(mi.SurfaceInteraction3f, PLACES * len(incident))
+    si = dr.zeros(mi.SurfaceInteraction3f, places * len(incident))
     si.uv = mi.Point2f(np.repeat(uv, len(incident), axis=1))
-    many = np.tile(incident, (PLACES, 1)), np.tile(outgoing, (PLACES, 1))
-    value = _at(bsdf, name, si, *many).reshape(PLACES, len(incident), 3) / incident[:, 2:]
+    many = np.tile(incident, (places, 1)), np.tile(outgoing, (places, 1))
+    value = _evaluate_at(bsdf, name, si, *many).reshape(places, len(incident), 3) / incident[:, 2:]
     rounding = ROUNDING * (np.abs(value).max(axis=(0, 2)) + 0.01)[:, None]  # [pair, 1]
     change = value - value[0]  # [place, pair, channel]
-    dullest = int(np.argmin(rounding))
-    alike = np.abs(change - change[:, [dullest]]) <= rounding + rounding[dullest]
+    least_glossy = int(np.argmin(rounding))
+    alike = np.abs(change - change[:, [least_glossy]]) <= rounding + rounding[least_glossy]
     return bool((np.abs(change) > rounding).any()), bool(alike.all())
 
 
-def anisotropic(bsdf: mi.BSDF, name: str) -> bool:
+def is_anisotropic(bsdf: mi.BSDF, name: str) -> bool:
     """Whether a BRDF changes when both directions are turned about the normal."""
-    incident, outgoing = probes()
-    value = evaluated(bsdf, name, incident, outgoing)
-    turned = evaluated(bsdf, name, incident @ TURNED, outgoing @ TURNED)
-    return bool((np.abs(turned - value) > UNLIKE * np.abs(value).max()).any())
+    incident, outgoing = probe_directions()
+    turn = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]], np.float32)  # by 53 degrees
+    value = evaluate_brdf(bsdf, name, incident, outgoing)
+    turned = evaluate_brdf(bsdf, name, incident @ turn, outgoing @ turn)
+    unlike = 1e-2 * np.abs(value).max()  # more than tables and rounding make
+    return bool((np.abs(turned - value) > unlike).any())
 
 
-def probes() -> tuple[Floats, Floats]:
-    """Pairs of directions (3 * PROBES, 3), incident and outgoing: at the highlight, beside it, and anywhere."""
+def probe_directions(count: int = 12) -> tuple[Floats, Floats]:
+    """Pairs of directions (3 * count, 3), incident and outgoing: at the highlight, beside it, and anywhere."""
     rng = np.random.default_rng(0)
-    outgoing, other = (_high(rng, PROBES) for _ in range(2))
+    outgoing, other = (_sample_high_directions(rng, count) for _ in range(2))
     mirrored = outgoing * np.array([-1, -1, 1], np.float32)
     beside = mirrored + 0.15 * other
     beside /= np.linalg.norm(beside, axis=1, keepdims=True)
     return np.concatenate([mirrored, beside, other]), np.tile(outgoing, (3, 1))
 
 
-def _high(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+def _sample_high_directions(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
     """Random directions (count, 3), none close to the horizon."""
-    z, phi = rng.uniform(LOWEST_PROBE, 1, count), rng.uniform(0, 2 * np.pi, count)
+    z, phi = rng.uniform(0.3, 1, count), rng.uniform(0, 2 * np.pi, count)
     r = np.sqrt(1 - z**2)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, lpmv
 
-HEIGHTS, AZIMUTHS = 64, 128
-
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
@@ -23,8 +21,8 @@ class DirectionGrid:
     heights, azimuths : int
     """
 
-    heights: int = HEIGHTS
-    azimuths: int = AZIMUTHS
+    heights: int = 64
+    azimuths: int = 128
 
     @property
     def directions(self) -> Floats:
@@ -58,7 +56,7 @@ class DirectionGrid:
                 found.append(norm * lpmv(k, degree, w[:, 2]) * around)
         return np.array(found)
 
-    def interpolated(self, values: NDArray[np.floating], directions: Floats) -> NDArray[np.floating]:
+    def interpolate(self, values: NDArray[np.floating], directions: Floats) -> NDArray[np.floating]:
         """Values (..., heights * azimuths) at directions (m, 3): (..., m); 0 below the horizon."""
         theta = np.arccos(np.clip(directions[:, 2], 0, 1)) * (self.heights / (np.pi / 2)) - 0.5
         phi = np.arctan2(directions[:, 1], directions[:, 0]) * (self.azimuths / (2 * np.pi)) - 0.5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,29 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.io.atomic import write_atomically
 from mi_sparse_prt.io.cache_folder import cache_folder
-from mi_sparse_prt.reflection.brdf_factors.diffuse_part import evaluated, probes
+from mi_sparse_prt.reflection.brdf_factors.diffuse_part import evaluate_brdf, probe_directions
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
-from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, factor_error
+from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, measure_factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.scene.materials import Material
 
 FORMAT = 1  # of the files; another one whenever factors of the same BSDF would be others
+
+
+@dataclass(frozen=True)
+class FactorOptions:
+    """What factors are made of, and how their errors are measured.
+
+    Attributes
+    ----------
+    grid : DirectionGrid
+        Of incident and of outgoing directions.
+    pairs : int
+        Of directions at which the error is measured.
+    """
+
+    grid: DirectionGrid = DirectionGrid()
+    pairs: int = 1 << 17
 
 
 def factors_of(
@@ -30,6 +47,7 @@ def factors_of(
     terms: int = 4,
     target_error: float | None = None,
     folder: Path | None = None,
+    options: FactorOptions | None = None,
 ) -> BrdfFactors:
     """Factor a reflective BSDF, or find the factors that an earlier call left in a folder.
 
@@ -42,11 +60,12 @@ def factors_of(
     terms : int
         K, 1 to 16; [HR10] takes 4. Fewer if one would be without its partner (``BrdfFactors.complete``).
     target_error : float, optional
-        Relative L2 error over all pairs of directions, as ``factor_error`` measures it: the fewest terms that meet it,
+        Relative L2 error over all pairs of directions, see ``measure_factor_error``: the fewest terms that meet it,
         instead of ``terms``. If 16 do not, they are taken, and a `PrtWarning` says how far they are.
     folder : Path, optional
         Made if it does not exist; the default is ``brdf`` in ``io.cache_folder()``. Files in it, 1 or 2 MB each,
         may be deleted at any time; one is found by all that the BSDF shows of itself, whatever its shape's name.
+    options : FactorOptions, optional
 
     Returns
     -------
@@ -59,7 +78,7 @@ def factors_of(
     """
     if not 1 <= terms <= MOST_TERMS:
         raise PrtError(f"shape '{name}': {terms} factors of its BRDF; give 1 to {MOST_TERMS}")
-    factors, error = _found_or_made(bsdf, name, folder or cache_folder() / "brdf")
+    factors, error = _find_or_make(bsdf, name, folder or cache_folder() / "brdf", options or FactorOptions())
     if target_error is None:
         return factors.complete(terms)
     enough = error.terms_for(target_error)
@@ -73,15 +92,17 @@ def factors_of(
     return factors.first(enough or MOST_TERMS)
 
 
-def _found_or_made(bsdf: mi.BSDF, name: str, folder: Path) -> tuple[BrdfFactors, FactorError]:
+def _find_or_make(
+    bsdf: mi.BSDF, name: str, folder: Path, options: FactorOptions
+) -> tuple[BrdfFactors, FactorError]:
     """All terms and their errors."""
-    grid = DirectionGrid()
-    path = folder / f"{_key(bsdf, name, grid)}.npz"
+    grid = options.grid
+    path = folder / f"{_key(bsdf, name, options)}.npz"
     found = _read(path, grid)
     if found:
         return found
     factors = factor_brdf(bsdf, name, MOST_TERMS, grid)
-    error = factor_error(factors, bsdf, name)
+    error = measure_factor_error(factors, bsdf, name, pairs=options.pairs)
     try:
         _write(path, factors, error)
     except OSError as problem:  # the result is good, only not kept
@@ -89,12 +110,13 @@ def _found_or_made(bsdf: mi.BSDF, name: str, folder: Path) -> tuple[BrdfFactors,
     return factors, error
 
 
-def _key(bsdf: mi.BSDF, name: str, grid: DirectionGrid) -> str:
+def _key(bsdf: mi.BSDF, name: str, options: FactorOptions) -> str:
     """Of all that the BSDF shows, and of some values, as plugins may show too little of themselves."""
     carrier = mi.load_dict({"type": "rectangle", "bsdf": bsdf})  # what materials are read from
     shown = Material(carrier, name, []).digest()
-    state = hashlib.sha256(json.dumps([FORMAT, MOST_TERMS, grid.heights, grid.azimuths]).encode())
-    state.update(shown + evaluated(bsdf, name, *probes()).tobytes())
+    made_with = [FORMAT, MOST_TERMS, options.grid.heights, options.grid.azimuths, options.pairs]
+    state = hashlib.sha256(json.dumps(made_with).encode())
+    state.update(shown + evaluate_brdf(bsdf, name, *probe_directions()).tobytes())
     return state.hexdigest()[:32]
 
 

@@ -30,12 +30,6 @@ from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, Doubles, Floats
 
 MOST_TERMS = 16
-LEFT_OVER = 16  # vectors more than terms that a basis begins with
-ITERATIONS = 2  # of it, multiplied with the matrix and its transpose
-FALL = 2.0  # power of light per spherical harmonic of degree l: (l + 1)^-FALL
-LIGHT_ORDER = 16  # degrees beyond have the power of the next one
-PURE = 0.98  # share of a term's power in one wave around the normal: the rest is rounding
-LANES = 1 << 21  # values of the BRDF at a time
 
 
 @dataclass(frozen=True)
@@ -101,15 +95,15 @@ class BrdfFactors:
             power = (np.abs(np.fft.rfft(parts, axis=2)) ** 2 * weights).sum(axis=1)  # [part, m]
             share = power / np.maximum(power.sum(axis=1, keepdims=True), 1e-30)
             m = int(share[0].argmax())
-            if share[:, m].min() < PURE:
+            if share[:, m].min() < 0.98:  # the rest is rounding
                 return None
             found.append(m)
         return found
 
     def values(self, incident: Floats, outgoing: Floats) -> Doubles:
         """(m, channels) at pairs of directions (m, 3), local frame."""
-        f = self.grid.interpolated(self.incident, incident)  # [term, pair]
-        g = self.grid.interpolated(self.outgoing, outgoing)  # [term, channel, pair]
+        f = self.grid.interpolate(self.incident, incident)  # [term, pair]
+        g = self.grid.interpolate(self.outgoing, outgoing)  # [term, channel, pair]
         found: Doubles = np.einsum("km,kcm->mc", f, g) + self.diffuse_values(incident, outgoing)
         return found
 
@@ -150,21 +144,26 @@ def factor_brdf(
     part = GlossyPart(bsdf, name)
     grid = grid or DirectionGrid()
     into, out = _weights(grid)
-    left, right = _factored(_weighted(part, grid), _light(grid), terms, seed)
-    return made_of(part, grid, left.T / into, right.reshape(len(right), part.channels, -1) / out)
+    left, right = _factorise(_weighted_matrix(part, grid), _light(grid), terms, seed)
+    return join_factors(part, grid, left.T / into, right.reshape(len(right), part.channels, -1) / out)
 
 
-def made_of(part: GlossyPart, grid: DirectionGrid, incident: Doubles, outgoing: Doubles) -> BrdfFactors:
+def join_factors(part: GlossyPart, grid: DirectionGrid, incident: Doubles, outgoing: Doubles) -> BrdfFactors:
     """Factors (K, grid) and (K, channels, grid) of a glossy part, with the diffuse one unless that varies."""
     diffuse = part.diffuse[: part.channels] * (not part.varying_diffuse)
     f, g = incident.astype(np.float32), outgoing.astype(np.float32)
     return BrdfFactors(grid, diffuse, f, g, part.varying_diffuse)
 
 
-def glossy_rows(part: GlossyPart, grid: DirectionGrid) -> Iterator[tuple[slice, Floats]]:
-    """Glossy BRDF times the incident cosine, (b, channels, outgoing), for some incident directions at a time."""
+def glossy_rows(
+    part: GlossyPart, grid: DirectionGrid, lanes: int = 1 << 21
+) -> Iterator[tuple[slice, Floats]]:
+    """Glossy BRDF times the incident cosine, (b, channels, outgoing), for some incident directions at a time.
+
+    As many as make ``lanes`` values of the BRDF.
+    """
     every = grid.directions
-    step = max(1, LANES // len(every))
+    step = max(1, lanes // len(every))
     for a in range(0, len(every), step):
         some = slice(a, min(a + step, len(every)))
         w = every[some]
@@ -178,7 +177,7 @@ def _weights(grid: DirectionGrid) -> tuple[Doubles, Doubles]:
     return np.sqrt(areas), np.sqrt(areas * grid.directions[:, 2])
 
 
-def _weighted(part: GlossyPart, grid: DirectionGrid) -> Floats:
+def _weighted_matrix(part: GlossyPart, grid: DirectionGrid) -> Floats:
     """The matrix (incident, channels * outgoing); 270 MB for a grey BSDF."""
     into, out = (x.astype(np.float32) for x in _weights(grid))
     n = len(into)
@@ -192,14 +191,15 @@ def _light(grid: DirectionGrid) -> tuple[Floats, float]:
     """The mean product of light from two incident directions, times roots of their solid angles: (r, grid) whose
     product with itself, transposed, and with this much of the identity added, is that matrix.
     """
-    degree = np.repeat(np.arange(LIGHT_ORDER + 1), 2 * np.arange(LIGHT_ORDER + 1) + 1)
-    rest = (LIGHT_ORDER + 2.0) ** -FALL  # of all higher degrees
-    amplitude = np.sqrt((degree + 1.0) ** -FALL - rest)
-    smooth = amplitude[:, None] * grid.harmonics(LIGHT_ORDER) * np.sqrt(grid.solid_angles)
+    order, fall = 16, 2.0  # power (l + 1)^-fall per harmonic of degree l, see above
+    degree = np.repeat(np.arange(order + 1), 2 * np.arange(order + 1) + 1)
+    rest = (order + 2.0) ** -fall  # of all higher degrees
+    amplitude = np.sqrt((degree + 1.0) ** -fall - rest)
+    smooth = amplitude[:, None] * grid.harmonics(order) * np.sqrt(grid.solid_angles)
     return smooth.astype(np.float32), rest
 
 
-def _factored(matrix: Floats, light: tuple[Floats, float], terms: int, seed: int) -> tuple[Floats, Floats]:
+def _factorise(matrix: Floats, light: tuple[Floats, float], terms: int, seed: int) -> tuple[Floats, Floats]:
     """Left (n, k) and right (k, m) factors of the best approximation A of that rank, both of the same norms.
 
     Best is the least ||root(C) (matrix - A)||, where C (n, n) is what ``_light`` says: columns of the right factor are
@@ -207,15 +207,16 @@ def _factored(matrix: Floats, light: tuple[Floats, float], terms: int, seed: int
     from random vectors (Halko, Martinsson and Tropp 2011, algorithms 4.4 and 5.3).
     """
     smooth, rest = light
+    oversampling, iterations = 16, 2
 
     def lit(x: Floats) -> Floats:
         found: Floats = smooth.T @ (smooth @ x) + np.float32(rest) * x
         return found
 
-    width = min(terms + LEFT_OVER, *matrix.shape)
+    width = min(terms + oversampling, *matrix.shape)
     basis = np.random.default_rng(seed).standard_normal((matrix.shape[1], width)).astype(np.float32)
     basis = np.linalg.qr(basis)[0]
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         basis = np.linalg.qr(matrix.T @ lit(matrix @ basis))[0]
     left = matrix @ basis
     turn = np.linalg.eigh(left.T.astype(np.float64) @ lit(left))[1][:, : -terms - 1 : -1].astype(np.float32)

@@ -11,9 +11,7 @@ import numpy as np
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, Doubles
-from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors, glossy_rows, made_of
-
-HIGHEST = 12  # order: 169 terms
+from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors, glossy_rows, join_factors
 
 
 def harmonic_factors(bsdf: mi.BSDF, name: str, order: int, grid: DirectionGrid | None = None) -> BrdfFactors:
@@ -46,20 +44,21 @@ def harmonic_factors(bsdf: mi.BSDF, name: str, order: int, grid: DirectionGrid |
     PrtError
         If the order is out of range, and as ``factor_brdf``.
     """
-    if not 0 <= order <= HIGHEST:
-        raise PrtError(f"shape '{name}': harmonics of order {order}; give 0 to {HIGHEST}")
+    highest = 12  # 169 terms
+    if not 0 <= order <= highest:
+        raise PrtError(f"shape '{name}': harmonics of order {order}; give 0 to {highest}")
     part = GlossyPart(bsdf, name)
     grid = grid or DirectionGrid()
     roots = np.sqrt(grid.solid_angles)
-    basis = _orthonormal(grid, order)  # [term, incident]
+    basis = _orthonormal_basis(grid, order)  # [term, incident]
     n = len(roots)
     fit = np.zeros((len(basis), part.channels * n))
     for some, values in glossy_rows(part, grid):
         fit += (basis[:, some] * roots[some]).astype(np.float32) @ values.reshape(-1, fit.shape[1])
-    return made_of(part, grid, basis / roots, fit.reshape(len(basis), -1, n))
+    return join_factors(part, grid, basis / roots, fit.reshape(len(basis), -1, n))
 
 
-def _orthonormal(grid: DirectionGrid, order: int) -> Doubles:
+def _orthonormal_basis(grid: DirectionGrid, order: int) -> Doubles:
     """Functions (terms, grid) that span harmonics times the cosine's root, times roots of solid angles."""
     scaled = grid.harmonics(order) * np.sqrt(grid.directions[:, 2] * grid.solid_angles)
     q, r = np.linalg.qr(scaled.T)

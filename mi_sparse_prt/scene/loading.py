@@ -1,0 +1,55 @@
+"""Scenes from Mitsuba's XML files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.scene import Scene
+
+
+def load_scene(path: str | Path, edge_length: float | None = None, **parameters: Any) -> Scene:
+    """Load a Mitsuba XML scene.
+
+    Parameters
+    ----------
+    path : str or Path
+        The XML file; file names inside are relative to it.
+    edge_length : float, optional
+        World units; see `Scene.from_mitsuba`.
+    **parameters
+        Values for the XML's ``<default name=...>`` entries, as Mitsuba's ``-D`` gives them.
+
+    Raises
+    ------
+    PrtError
+        Missing file, XML or plugin error, and everything that `Scene.from_mitsuba` refuses.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PrtError(f"scene file {path} does not exist: check the path")
+    try:
+        loaded = mi.load_file(str(path), optimize=False, **{k: str(v) for k, v in parameters.items()})
+    except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others, over many lines
+        reason = _one_line(error).replace(f"{path} ", "")
+        raise PrtError(f"scene file {path} cannot be loaded: {reason}") from error
+    if not isinstance(loaded, mi.Scene):
+        raise PrtError(f"scene file {path} holds a {type(loaded).__name__}: its root element must be <scene>")
+    try:
+        scene = Scene._build(loaded, edge_length)
+    except PrtError as error:
+        raise PrtError(f"scene file {path}: {error}") from error
+    scene.path = str(path)
+    scene._warn()
+    return scene
+
+
+def _one_line(error: Exception, limit: int = 400) -> str:
+    """A Mitsuba error without its line breaks, colours and places in Mitsuba's own source."""
+    text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.(cpp|h):\d+\] ", "", str(error))
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,45 @@
+"""Values of a scene's shapes on the device, by what a ray has hit."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class ShapeTable:
+    """One number for each shape of a scene, found on the device from pointers to shapes.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    values : (shapes,) uint32
+        In the order of ``scene.shapes()``.
+
+    Notes
+    -----
+    A pointer to a shape is a number on the device, by which Dr.Jit knows objects; shapes do not follow each other.
+    """
+
+    def __init__(self, scene: mi.Scene, values: ArrayLike) -> None:
+        pointers = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+        table = np.zeros(int(pointers.max()) + 1, np.uint32)
+        table[pointers] = values
+        self._table = mi.UInt32(table)
+
+    def gather(self, shape: mi.ShapePtr, active: mi.Mask) -> mi.UInt32:
+        """The shapes' numbers; 0 where not ``active``."""
+        return dr.gather(mi.UInt32, self._table, dr.reinterpret_array(mi.UInt32, shape), active)
+
+
+def first_triangles(scene: mi.Scene) -> ShapeTable:
+    """Where the triangles of each shape begin among those of all, shape after shape.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        Of meshes.
+    """
+    counts = [shape.face_count() for shape in scene.shapes()]
+    return ShapeTable(scene, np.cumsum([0, *counts[:-1]]))

@@ -1,0 +1,168 @@
+"""From Mitsuba shapes to clean triangles: the one place where a user's scene is read.
+
+The rooms behind this one never look at Mitsuba shapes.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.materials import Material
+from mi_sparse_prt.scene.mesh_cleaning import (
+    check_geometry,
+    drop_degenerate,
+    drop_unreferenced,
+    faces_inwards,
+    flip_sides,
+    make_unit_normals,
+    split_by_face,
+    stabilise_normals,
+)
+from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
+from mi_sparse_prt.scene.parametric_shapes import parametric_mesh
+from mi_sparse_prt.scene.subdivision import subdivide
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
+
+
+def read_surfaces(
+    scene: mi.Scene, edge_length: float | None
+) -> tuple[list[tuple[TriangleMesh, Material]], list[str]]:
+    """Clean triangle meshes of a Mitsuba scene, in world space, and what was handled on the user's behalf.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    edge_length : float, optional
+        As for `Scene.from_mitsuba`.
+
+    Returns
+    -------
+    surfaces : list of (TriangleMesh, Material)
+        One for each shape; a mesh may have no triangles left.
+    notes : list of str
+
+    Raises
+    ------
+    PrtError
+        As for `Scene.from_mitsuba`.
+    """
+    if not mi.is_rgb or not dr.is_jit_v(mi.Float):
+        raise PrtError(f"variant {mi.variant()} is not supported: use llvm_ad_rgb or cuda_ad_rgb")
+    if edge_length is not None and not edge_length > 0:
+        raise PrtError(f"edge_length must be positive (or inf), not {edge_length}")
+    most_vertices = 5_000_000  # 6144 directions would need 4 GB of visibility bits alone
+    shapes = scene.shapes()
+    if not shapes:
+        raise PrtError("the scene has no mesh: add at least one shape")
+    notes: list[str] = []
+    materials = [
+        Material(shape, name, notes) for shape, name in zip(shapes, _unique_names(shapes), strict=True)
+    ]
+    clean = [
+        _clean_mesh(s, m.name, notes) if s.is_mesh() else None for s, m in zip(shapes, materials, strict=True)
+    ]
+    if edge_length is None:
+        edge_length = _diagonal(shapes, clean) / 64
+
+    meshes: list[TriangleMesh] = []
+    for shape, mesh, material in zip(shapes, clean, materials, strict=True):
+        limit = most_vertices - sum(len(m.positions) for m in meshes)
+        mesh = _tessellate(shape, material, edge_length, limit) if mesh is None else mesh
+        if material.one_sided and len(mesh.triangles) and faces_inwards(mesh):
+            notes.append(
+                f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
+                "(set flip_normals, or use a twosided BSDF, if that is not meant)"
+            )
+        if shape.is_mesh():
+            mesh = subdivide(mesh, edge_length, limit)
+        meshes.append(mesh)
+    return list(zip(meshes, materials, strict=True)), notes
+
+
+def _unique_names(shapes: list[mi.Shape]) -> list[str]:
+    """A unique name for each shape: its id, else the name of its file, else its type and number."""
+    names: list[str] = ["type"]  # a reserved word in Mitsuba's dictionaries
+    for k, shape in enumerate(shapes):
+        name = shape.id()
+        if not name or name.startswith("_"):
+            file = re.search(r'name = "([^"]+)"', str(shape)) if shape.is_mesh() else None
+            name = Path(file.group(1)).stem if file else f"{shape.class_name().lower()}_{k}"
+        name = re.sub(r"[.\s/]", "_", name)
+        unique, suffix = name, 2
+        while unique in names:
+            unique, suffix = f"{name}_{suffix}", suffix + 1
+        names.append(unique)
+    return names[1:]
+
+
+def _diagonal(shapes: list[mi.Shape], clean: list[TriangleMesh | None]) -> float:
+    """The diagonal of the box around all shapes, in which unused vertices do not count."""
+    points: list[NDArray] = []
+    for shape, mesh in zip(shapes, clean, strict=True):
+        if mesh is None:
+            box = shape.bbox()
+            points += [np.array(box.min).reshape(1, 3), np.array(box.max).reshape(1, 3)]
+        else:
+            points.append(mesh.positions)
+    return float(np.linalg.norm(np.ptp(np.concatenate(points).astype(np.float64), axis=0)))
+
+
+def _tessellate(shape: mi.Shape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
+    """The grid of a sphere, disk or cylinder, in world space; every other shape is refused."""
+    kind = {"Sphere": "sphere", "Disk": "disk", "Cylinder": "cylinder"}.get(shape.class_name())
+    if kind is None:
+        raise PrtError(
+            f"shape '{material.name}' is of type {shape.class_name()}, which is not made of triangles: "
+            "replace it by a mesh (ply, obj), an instance by a copy of its shapes"
+        )
+    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
+    mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
+    return parametric_mesh(
+        kind,
+        to_world,
+        edge_length,
+        material.name,
+        limit=limit,
+        flip=shape.has_flipped_normals() != mirrored,
+        weld=material.constant,
+    )
+
+
+def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
+    """A Mitsuba mesh as clean triangles in world space, with the normals that Mitsuba shades with."""
+    mesh = read_mesh(shape, name)
+    check_geometry(mesh)
+    if mesh.normals is not None:
+        mesh = stabilise_normals(mesh, _recomputed_normals(mesh))
+    mesh, dropped = drop_degenerate(mesh)
+    if dropped:
+        notes.append(f"shape '{name}': {dropped} triangles without area are left out")
+    mesh, dropped = drop_unreferenced(mesh)
+    if dropped:
+        notes.append(f"shape '{name}': {dropped} vertices that no triangle uses are left out")
+    if mesh.normals is None:  # Mitsuba shades such meshes flat
+        mesh = split_by_face(mesh)
+    mesh, zero = make_unit_normals(mesh)
+    if zero:
+        notes.append(
+            f"shape '{name}': {zero} vertices have a normal of length zero; it is computed from their faces"
+        )
+    return flip_sides(mesh) if shape.has_flipped_normals() else mesh
+
+
+def _recomputed_normals(mesh: TriangleMesh) -> NDArray[np.float32]:
+    """(n, 3) normals as Mitsuba computes them for files that have none."""
+    scratch = mi.Mesh(mesh.name, len(mesh.positions), len(mesh.triangles), has_vertex_normals=True)
+    parameters = mi.traverse(scratch)
+    parameters["faces"] = mi.UInt32(mesh.triangles.astype(np.uint32).ravel())
+    parameters["vertex_positions"] = mi.Float(mesh.positions.ravel())
+    parameters.update()
+    return np.array(scratch.vertex_normals_buffer(), np.float32).reshape(-1, 3)

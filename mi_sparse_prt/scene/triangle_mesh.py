@@ -1,0 +1,75 @@
+"""Triangles with one normal per vertex, in plain NumPy, and what every step on them needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass
+class TriangleMesh:
+    """Triangles with one normal per vertex.
+
+    Attributes
+    ----------
+    name : str
+        What messages call it.
+    positions : (n, 3) float32
+    normals : (n, 3) float32 or None
+        Unit shading normals; None until computed.
+    triangles : (t, 3) int32
+    texcoords : (n, 2) float32 or None
+    vertex_attributes, face_attributes : dict of name -> (n, k) or (t, k) float32
+        Mesh attributes under Mitsuba's names (``vertex_color``, ``face_id``, ...).
+    """
+
+    name: str
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32] | None
+    triangles: NDArray[np.int32]
+    texcoords: NDArray[np.float32] | None = None
+    vertex_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    face_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def take_vertices(self, index: NDArray[np.integer], triangles: NDArray[np.integer]) -> TriangleMesh:
+        """The mesh whose vertex k is this one's vertex ``index[k]``; ``triangles`` has the new numbers."""
+        return replace(
+            self,
+            positions=self.positions[index],
+            normals=None if self.normals is None else self.normals[index],
+            texcoords=None if self.texcoords is None else self.texcoords[index],
+            vertex_attributes={k: v[index] for k, v in self.vertex_attributes.items()},
+            triangles=np.ascontiguousarray(triangles, np.int32),
+        )
+
+    def take_triangles(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> TriangleMesh:
+        """The mesh with only the triangles of ``index`` (indices or a mask), all vertices kept."""
+        return replace(
+            self,
+            triangles=np.ascontiguousarray(self.triangles[index]),
+            face_attributes={k: v[index] for k, v in self.face_attributes.items()},
+        )
+
+
+def triangle_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
+    """(t, 3) cross products of the triangles' edges: along the face normal, twice the area long."""
+    p = mesh.positions.astype(np.float64)[mesh.triangles]  # [triangle, corner, xyz]
+    return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+
+
+def normalise_rows(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows scaled to unit length; zero rows stay zero."""
+    length = np.linalg.norm(v, axis=1, keepdims=True)
+    return v / np.where(length > 0, length, 1.0)
+
+
+def unique_rows(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First index of each distinct row, and for each row which it is; far faster than `np.unique` by rows."""
+    code = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        _, value = np.unique(column, return_inverse=True)
+        _, code = np.unique(code * (value.max(initial=0) + 1) + value, return_inverse=True)
+    _, first = np.unique(code, return_index=True)
+    return first, code
