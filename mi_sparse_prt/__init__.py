@@ -20,7 +20,9 @@ except PrtError as _error:
 
 from mi_sparse_prt.compression.compress import compress  # noqa: E402
 from mi_sparse_prt.emission.cubemap import CubemapLighting  # noqa: E402
+from mi_sparse_prt.emission.emitters import SceneEmitters  # noqa: E402
 from mi_sparse_prt.emission.environment import Environment, load_environment  # noqa: E402
+from mi_sparse_prt.measurement.pixels import camera_pixels  # noqa: E402
 from mi_sparse_prt.plugins import register as _register_plugins  # noqa: E402
 from mi_sparse_prt.precompute import precompute, precompute_glossy  # noqa: E402
 from mi_sparse_prt.relighting.image import render  # noqa: E402
@@ -42,8 +44,10 @@ __all__ = [
     "PrtError",
     "PrtWarning",
     "Scene",
+    "SceneEmitters",
     "Validation",
     "__version__",
+    "camera_pixels",
     "compress",
     "load_environment",
     "load_scene",

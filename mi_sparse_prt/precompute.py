@@ -11,11 +11,16 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.emitters import SceneEmitters
 from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
+from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.methods.brute_force import share_above_horizon
-from mi_sparse_prt.methods.execution import Execution, indirect_solver
+from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_of
+from mi_sparse_prt.methods.lamps import gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
@@ -23,6 +28,7 @@ from mi_sparse_prt.planner.candidates import Ladder, Ranking, ladder
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import forecast
 from mi_sparse_prt.planner.pilot import measure
+from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.reflection.surfaces import vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -36,7 +42,7 @@ _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces th
 
 def precompute(
     scene: Scene,
-    lighting: CubemapLighting,
+    lighting: CubemapLighting | SceneEmitters,
     method: str | Plan = "auto",
     basis: str = "direction",
     max_depth: int = 5,
@@ -48,6 +54,7 @@ def precompute(
     indirect_resolution: int | None = None,
     strata: int = 2,
     checkpoint_folder: str | Path | None = None,
+    measurement: Measurement | None = None,
     terms: int = 0,
     harmonics: int | None = None,
 ) -> LightTransport:
@@ -56,8 +63,9 @@ def precompute(
     Parameters
     ----------
     scene : Scene
-    lighting : CubemapLighting
-        The emission space: one column per texel.
+    lighting : CubemapLighting or SceneEmitters
+        The emission space: one column per texel, or per lamp. Of lamps, ``method`` is ``"gather"`` (diffuse scenes, the
+        default there) or ``"brute_force"`` (64 paths per element, or ``spp``).
     method : {"auto", "brute_force", "sparse", "huang2010", "gather"} or Plan
         What is evaluated, and how. ``"auto"`` measures on a few hundred vertices what rays, paths and gathering cost
         in this scene on this machine, predicts time and error of all plans, and takes the quickest that meets the
@@ -94,6 +102,8 @@ def precompute(
     checkpoint_folder : path, optional
         Finished rows of path-traced indirect light are kept there until the matrix is complete: the same call after
         an interruption goes on where it stopped (``"huang2010"``: with the dense rows only).
+    measurement : Measurement, optional
+        Where rows hold: the vertices of the scene's meshes if not given, or ``camera_pixels``.
     terms : int
         K, in-out factors of each BRDF that is not diffuse ([HR10] eq. 2), for radiance that depends on the view; with
         0, all surfaces are seen as diffuse. ``"auto"`` then means finite elements, with ever more rays for a target.
@@ -115,6 +125,18 @@ def precompute(
     PrtError
         If an argument makes no sense, or the matrix or what a method needs for it would not fit into memory.
     """
+    where = mesh_vertices(scene) if measurement is None else _of_scene(measurement, scene)
+    run = Run(
+        seed, progress=progress, checkpoint_folder=Path(checkpoint_folder) if checkpoint_folder else None
+    )
+    if isinstance(lighting, SceneEmitters):
+        if terms or harmonics is not None or target_error is not None:
+            raise PrtError(
+                "lamps: terms, harmonics and target_error are for light from a cubemap; leave them out"
+            )
+        return _lit_by_lamps(
+            Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth), method, spp, run
+        )
     settings = Settings(
         lighting.resolution,
         method,
@@ -127,18 +149,21 @@ def precompute(
         strata,
         terms,
         harmonics,
+        where.kind,
     )
     reset_peak_memory()
-    clock = Stopwatch()
+    clock = run.clock
     with clock.phase("setup"):
-        reflection = vertex_reflection(scene, terms, harmonics)
-        problem = Problem(scene, lighting, reflection, basis, max_depth)
+        seen = (
+            vertex_reflection(scene, terms, harmonics) if settings.view_dependent else _diffuse(scene, where)
+        )
+        problem = Problem(scene, lighting, where, seen, basis, max_depth)
         direct = DirectSolver(scene.normalised, lighting, problem.points, basis, strata, seed)
     reason = _no_indirect(problem, settings, clock)
     proposals = _proposals(problem, direct, settings, reason is None, clock)
     with clock.phase("pilot"):
         expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
-    evaluation = Execution(problem, direct, settings, reason is None, clock, progress, checkpoint_folder)
+    evaluation = Execution(problem, direct, settings, reason is None, run)
     tried = _tried_direct(evaluation, proposals, problem, settings, clock)
     if tried:
         expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
@@ -159,11 +184,59 @@ def precompute(
     return transport
 
 
+def _of_scene(measurement: Measurement, scene: Scene) -> Measurement:
+    if measurement.normalised is None or measurement.scene_hash != scene.hash:
+        raise PrtError(
+            f"this measurement is of another scene than {scene.path or 'the one given'}, or came from a file; "
+            "make it of this scene: camera_pixels(scene)"
+        )
+    return measurement
+
+
+def _diffuse(scene: Scene, where: Measurement) -> Diffuse:
+    return Diffuse(scene.albedo if where.albedo is None else where.albedo)
+
+
+def _lit_by_lamps(problem: Problem, method: str | Plan, spp: int | None, run: Run) -> LightTransport:
+    """The matrix whose columns are the scene's own emitters."""
+    if method not in ("auto", "gather", "brute_force"):
+        raise PrtError(f'method {method!r} knows no lamps; use "gather" or "brute_force", or leave it out')
+    reset_peak_memory()
+    if method == "gather" or (method == "auto" and problem.scene.diffuse):
+        name, parts = "gather", gathered_lamps(problem, run)
+    else:
+        name, parts = "brute_force", path_traced_lamps(problem, run, spp or 64)
+    transport = matrix_of(problem, parts)
+    with run.clock.phase("held_out"):
+        error = held_out_lamp_error(problem, transport, run.seed)
+    size = len(problem.points) * problem.emission.size
+    transport.report.update(
+        {
+            "elements_total": size,
+            "elements_evaluated": parts.elements_evaluated,
+            "elements": parts.elements,
+            "rays": parts.rays,
+            "skipped": parts.skipped,
+            "estimated_error": error,
+            "seed": run.seed,
+            "parameters": {
+                "method": name,
+                "max_depth": problem.max_depth,
+                "lamps": list(problem.emission.names),
+            },
+            "scene": problem.scene.summary,
+            "versions": versions(),
+        }
+        | _costs(transport, run.clock)
+    )
+    return transport
+
+
 def _no_indirect(problem: Problem, settings: Settings, clock: Stopwatch) -> str | None:
     """Why there is no indirect light, or None."""
     if settings.max_depth == 2:
         return "max_depth 2 asks for direct light only"
-    if problem.scene.diffuse and not problem.scene.albedo.any():
+    if problem.scene.diffuse and not problem.reflection.albedo.any():
         return "every surface is black"
     with clock.phase("pilot"):
         surfaces_meet = indirect_solver(problem, settings).any_hit(_PILOT_RAYS)
@@ -183,7 +256,7 @@ def _proposals(
     """The plans to try, measured and ranked where the method leaves them open."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
         settings = replace(settings, spp=None, indirect_resolution=None)
-    elif settings.method != "auto" or settings.view_dependent:
+    elif settings.method != "auto" or settings.view_dependent or settings.measurement != "vertices":
         return ladder(settings)
     with clock.phase("plan"):
         costs = measure(problem, direct, settings, indirect)

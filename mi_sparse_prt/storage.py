@@ -9,6 +9,8 @@ import numpy as np
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.emitters import StoredEmitters
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.io.store import DAMAGE, Arrays, read_store
 from mi_sparse_prt.measurement.measurement import Measurement
 from mi_sparse_prt.operators.stored import operator_from_arrays
@@ -62,9 +64,14 @@ def load_transport(path: str | Path, scene: Scene | None = None) -> LightTranspo
 
 def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightTransport:
     emission = attributes["emission"]
-    if emission["kind"] != "cubemap":
-        raise PrtError(f"{path} has the emission space {emission['kind']!r}, which is unknown here")
-    lighting = CubemapLighting(emission["resolution"])
+    if emission["kind"] == "cubemap":
+        lighting: EmissionSpace = CubemapLighting(emission["resolution"])
+    elif emission["kind"] == "emitters":
+        lighting = StoredEmitters(emission["names"])
+    else:
+        raise PrtError(
+            f"{path} has the emission space {emission['kind']!r}, which is unknown here; upgrade the package"
+        )
     measurement = Measurement.from_arrays(attributes["measurement"], _under("measurement.", arrays))
     known = attributes["reflection"]
     reflection = _REFLECTIONS[known["kind"]].from_arrays(known, _under("reflection.", arrays))
@@ -72,7 +79,7 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
     operators = {
         name: operator_from_arrays(name, kinds, arrays, lighting) for name in kinds if "." not in name
     }
-    rows = reflection.row_count, lighting.n_directions
+    rows = reflection.row_count, lighting.size
     if len(reflection.albedo) != len(measurement) or any(
         operator.shape[:2] != rows for operator in operators.values()
     ):

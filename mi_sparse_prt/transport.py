@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.io.store import write_store
-from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
+from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.stored import operator_arrays
@@ -62,7 +61,7 @@ class LightTransport:
 
     Attributes
     ----------
-    emission : CubemapLighting
+    emission : EmissionSpace
         E: the columns.
     basis : {"direction", "texel"}
     measurement : Measurement
@@ -77,7 +76,7 @@ class LightTransport:
         What was done, skipped, how long it took and how good it is; JSON as it is.
     """
 
-    emission: CubemapLighting
+    emission: EmissionSpace
     basis: str
     measurement: Measurement
     reflection: Reflection
@@ -87,8 +86,8 @@ class LightTransport:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(points, directions, 3)."""
-        return len(self.measurement), self.emission.n_directions, 3
+        """(outputs of the measurement, elements of the emission space, 3)."""
+        return self.measurement.outputs, self.emission.size, 3
 
     @property
     def nbytes(self) -> int:
@@ -96,7 +95,7 @@ class LightTransport:
         return sum(operator.nbytes for operator in self.operators.values())
 
     @property
-    def lighting(self) -> CubemapLighting:
+    def lighting(self) -> Any:
         """``emission``."""
         return self.emission
 
@@ -153,8 +152,15 @@ class LightTransport:
         PrtError
             If an index is out of range.
         """
-        chosen = _checked(ids, len(self.measurement), "vertex")
-        return self.reflection.radiosity(self.incident.rows(self.reflection.rows_of(chosen)), chosen)
+        measurement, reflection = self.measurement, self.reflection
+        chosen = _checked(ids, measurement.outputs, "vertex" if measurement.kind == "vertices" else "pixel")
+        if measurement.weights is None:
+            return reflection.radiosity(self.incident.rows(reflection.rows_of(chosen)), chosen)
+        weights = measurement.weights[chosen]
+        points = np.unique(weights.indices)
+        rows = reflection.radiosity(self.incident.rows(reflection.rows_of(points)), points)
+        flat = weights[:, points] @ rows.reshape(len(points), -1)
+        return flat.reshape(len(chosen), *rows.shape[1:])
 
     def columns(self, ids: ArrayLike) -> Floats:
         """Columns of T: radiosity / pi of all points under light from one texel each.
@@ -173,14 +179,14 @@ class LightTransport:
         PrtError
             If an index is out of range.
         """
-        chosen = _checked(ids, self.emission.n_directions, "direction")
-        return self.reflection.radiosity(self.incident.columns(chosen))
+        chosen = _checked(ids, self.emission.size, "direction")
+        return self.measurement.combined(self.reflection.radiosity(self.incident.columns(chosen)))
 
     def irradiance(self, lighting: Any) -> Floats:
         """What leaves the points if they were white: irradiance / pi, (n, 3) float32 (see ``relight``)."""
         return self._incident_light(lighting)[: len(self.measurement)]
 
-    def relight(self, lighting: Environment | ArrayLike, outgoing: ArrayLike | None = None) -> Floats:
+    def relight(self, lighting: Any, outgoing: ArrayLike | None = None) -> Floats:
         """B = T L: light leaving the points under an environment.
 
         Parameters
@@ -197,12 +203,12 @@ class LightTransport:
         """
         incident = self._incident_light(lighting)
         if outgoing is None or not isinstance(self.reflection, InOutFactors):
-            return self.reflection.radiosity(incident)
+            return self.measurement.combined(self.reflection.radiosity(incident))
         towards = np.broadcast_to(np.asarray(outgoing, np.float32), self.reflection.normals.shape)
         towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-        return self.reflection.radiance(incident, towards)
+        return self.measurement.combined(self.reflection.radiance(incident, towards))
 
-    def coefficients(self, lighting: Environment | ArrayLike) -> Coefficients:
+    def coefficients(self, lighting: Any) -> Coefficients:
         """Irradiance / pi and terms of all points under an environment or L (n_directions, 3)."""
         n, found = len(self.measurement), self._incident_light(lighting)
         terms = np.zeros((n, self.terms, 3), np.float32)
@@ -216,11 +222,13 @@ class LightTransport:
     def apply(self, x: Floats) -> Floats:
         """Products T x: (n_directions, 3, k) to (n, 3, k), radiosity / pi; each channel has its own vectors."""
         incident = np.moveaxis(self.incident.apply(x), 1, 2)  # [row, k, channel]
-        return np.ascontiguousarray(np.moveaxis(self.reflection.radiosity(incident), 2, 1))
+        outgoing = self.measurement.combined(self.reflection.radiosity(incident))
+        return np.ascontiguousarray(np.moveaxis(outgoing, 2, 1))
 
     def adjoint(self, y: Floats) -> Floats:
         """Products of the transpose: (n, 3, k) to (n_directions, 3, k)."""
-        return self.incident.adjoint(self.reflection.radiosity_adjoint(np.asarray(y, np.float32)))
+        outgoing = self.measurement.spread(np.asarray(y, np.float32))
+        return self.incident.adjoint(self.reflection.radiosity_adjoint(outgoing))
 
     def as_linear_operator(self, channel: int | None = None) -> LinearOperator:
         """T for SciPy's iterative methods.
@@ -246,14 +254,17 @@ class LightTransport:
         PrtError
             If the matrix belongs to another scene.
         """
+        if self.measurement.kind != "vertices":
+            check_scene(self.scene_hash, scene)
+            return self
+        known = mesh_vertices(scene)
         source = row_order(self.scene_hash, self.measurement.keys, scene)
         if source is None:
-            return self
+            return replace(self, measurement=known)
         rows = self.reflection.rows_of(source)
-        groups = tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes)
         return replace(
             self,
-            measurement=self.measurement.take(source, groups),
+            measurement=known,
             reflection=self.reflection.take(source),
             operators={name: operator.take(rows) for name, operator in self.operators.items()},
         )
@@ -306,7 +317,7 @@ class LightTransport:
         attributes: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,
-            "emission": {"kind": "cubemap", "resolution": self.emission.resolution},
+            "emission": {"kind": self.emission.kind, **self.emission.attributes()},
             "basis": self.basis,
             "measurement": self.measurement.attributes(),
             "reflection": {"kind": self.reflection.kind, **self.reflection.attributes()},
@@ -387,11 +398,7 @@ def row_order(scene_hash: str, keys: NDArray[np.uint64], scene: Scene) -> NDArra
     PrtError
         If the matrix belongs to another scene.
     """
-    if scene.hash != scene_hash:
-        raise PrtError(
-            f"this matrix belongs to another scene than {scene.path or 'the one given'} "
-            "(geometry or materials differ); precompute it again"
-        )
+    check_scene(scene_hash, scene)
     wanted = vertex_points(scene).keys
     if np.array_equal(keys, wanted):
         return None
@@ -401,6 +408,15 @@ def row_order(scene_hash: str, keys: NDArray[np.uint64], scene: Scene) -> NDArra
     source = np.empty_like(ours)
     source[theirs] = ours
     return source
+
+
+def check_scene(scene_hash: str, scene: Scene) -> None:
+    """Refuse a scene whose geometry or materials are others (PrtError)."""
+    if scene.hash != scene_hash:
+        raise PrtError(
+            f"this matrix belongs to another scene than {scene.path or 'the one given'} "
+            "(geometry or materials differ); precompute it again"
+        )
 
 
 def _checked(ids: ArrayLike, count: int, what: str) -> NDArray[np.int64]:

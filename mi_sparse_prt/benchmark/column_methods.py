@@ -26,11 +26,10 @@ from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import Dense
 from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.huang2010 import huang2010_parts
-from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
-from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 CHOICES: dict[str, Columns] = {"clustered_columns": clustered_columns, "k_means_columns": k_means_columns}
@@ -72,7 +71,7 @@ def precompute_with_columns(
         return _of_nearest(scene, dense, mean, CHOICES[choice], seed)
 
     parts = huang2010_parts(scene, direct, paths, seed, clock, progress, columns=columns)
-    transport = matrix_of(Problem(scene, lighting, Diffuse(scene.albedo), max_depth=max_depth), parts)
+    transport = matrix_of(diffuse_problem(scene, lighting, max_depth), parts)
     transport.report.update(
         seconds=clock.report(),
         elements_total=len(points) * lighting.n_directions,

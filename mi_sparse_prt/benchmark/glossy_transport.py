@@ -13,6 +13,7 @@ from mi_sparse_prt.benchmark.factor_pictures import factor_picture
 from mi_sparse_prt.benchmark.machine import kept_memory, report_header
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
+from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.precompute import precompute
@@ -120,7 +121,8 @@ def diffuse_copy(scene: Scene) -> Scene:
 def _brute_force(scene: Scene, transport: LightTransport) -> float:
     """Seconds of paths for all elements, white light and all terms at once."""
     points, max_depth = vertex_points(scene), transport.report["parameters"]["max_depth"]
-    problem = Problem(scene, transport.emission, transport.reflection, max_depth=max_depth)
+    here = mesh_vertices(scene)
+    problem = Problem(scene, transport.lighting, here, transport.reflection, max_depth=max_depth)
     paths = TermPaths(problem, SPP)
     every = transport.lighting.n_directions
     chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]

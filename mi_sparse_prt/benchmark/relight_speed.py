@@ -14,9 +14,8 @@ from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
-from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 INDIRECT_RESOLUTION = 8
@@ -73,4 +72,4 @@ def _transport(
 ) -> LightTransport:
     direct = Visibility(bits, scene.normals, lighting)
     result = MethodResult(direct, indirect, 0, {}, {})
-    return matrix_of(Problem(scene, lighting, Diffuse(scene.albedo)), result)
+    return matrix_of(diffuse_problem(scene, lighting), result)

@@ -109,6 +109,8 @@ def _check(
         raise PrtError(f"method {method!r} is none of: {', '.join(METHODS)}")
     if "compressed" in transport.operators:
         raise PrtError("this matrix is compressed already; give the one that it was made of")
+    if transport.emission.kind != "cubemap":
+        raise PrtError("compression is for light from a cubemap; a matrix of lamps is small as it is")
     if method == "haar" and transport.terms:
         raise PrtError("method 'haar' is for matrices of diffuse surfaces; compress this one by 'cpca'")
     if method == "haar" and clusters is not None:
@@ -212,7 +214,7 @@ def _joined(transport: LightTransport, found: list[MeshClusters]) -> Clustered:
         coefficients,
         np.concatenate([mesh.means for mesh in found]),
         np.concatenate([_padded(mesh.bases, 1, widest) for mesh in found]),
-        transport.emission,
+        transport.lighting,
     )
 
 

@@ -94,7 +94,7 @@ def haar_part(
     ) as bar:
         found = [haar_mesh(transport, mesh, target_error, bar) for mesh in transport.meshes]
     part = _joined([mesh.part for mesh in found])
-    elements = part.scales.size * transport.emission.n_directions
+    elements = part.scales.size * transport.lighting.n_directions
     names = [mesh.name for mesh in transport.meshes]
     lengths = [np.diff(mesh.part.starts) for mesh in found]
     report = {
@@ -117,7 +117,7 @@ def haar_part(
 
 def haar_mesh(transport: LightTransport, mesh: MeshRange, target_error: float, bar: tqdm) -> HaarMesh:
     """Truncate the rows of one mesh; the bar is told of vertices that are done."""
-    sphere, m = mesh_rows(transport, mesh), transport.emission.n_directions
+    sphere, m = mesh_rows(transport, mesh), transport.lighting.n_directions
     step = max(1, BLOCK // (3 * m))
     share = max(target_error**2 - ROUNDING, 0)
     blocks, sums = [], np.zeros(5)
@@ -126,7 +126,7 @@ def haar_mesh(transport: LightTransport, mesh: MeshRange, target_error: float, b
         rows = sphere.rows(ids)  # [vertex, channel, direction]
         coefficients = haar(rows)
         energies = truncate(coefficients, share)
-        part = _stored(coefficients, transport.emission)
+        part = _stored(coefficients, transport.lighting)
         blocks.append(part)
         sums += _sums(rows, part, energies, sphere.weights[ids], transport.albedo[mesh.vertices][ids])
         bar.update(len(ids))

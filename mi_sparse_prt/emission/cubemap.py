@@ -12,6 +12,7 @@ NumPy arrays are used where things are computed once; the functions on Dr.Jit ar
 from __future__ import annotations
 
 import os
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +60,8 @@ class CubemapLighting:
         If `resolution` is not a power of two.
     """
 
+    kind: ClassVar[str] = "cubemap"
+
     def __init__(self, resolution: int = 32) -> None:
         if resolution != int(resolution) or resolution < 1 or int(resolution) & (int(resolution) - 1):
             raise PrtError(f"cubemap resolution {resolution} is not a power of two; use 8, 16, 32, 64, ...")
@@ -67,6 +70,15 @@ class CubemapLighting:
         directions, solid_angles = self.subdirections(1)
         self.directions: NDArray[np.float32] = directions[:, 0]
         self.solid_angles: NDArray[np.float32] = solid_angles[:, 0]
+
+    @property
+    def size(self) -> int:
+        """Elements of the basis: ``n_directions``."""
+        return self.n_directions
+
+    def attributes(self) -> dict[str, Any]:
+        """What files keep of it; JSON as it is."""
+        return {"resolution": self.resolution}
 
     def __repr__(self) -> str:
         return f"CubemapLighting({self.resolution})"

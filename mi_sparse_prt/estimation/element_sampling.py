@@ -78,7 +78,7 @@ def for_direct_light(
     effort : float
         Of the usual number of elements.
     """
-    lighting, direct = transport.emission, transport.operators["direct"]
+    lighting, direct = transport.lighting, transport.operators["direct"]
     rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
     floor, edges = 0.0, _NO_EDGES
     if not direct.dark_below_horizon:

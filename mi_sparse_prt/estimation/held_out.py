@@ -83,11 +83,11 @@ def held_out_error(
     """
     estimator, rng = _Estimator(problem, transport, seed), np.random.default_rng([seed, 1])
     if target is None:
-        return _estimate(estimator.samples(rng, 1.0))
+        return estimate_errors(estimator.samples(rng, 1.0))
     samples: Samples = {}
     for _ in range(round(1 / ROUND)):
         samples = _together(samples, estimator.samples(rng, ROUND))
-        found = _estimate(samples)
+        found = estimate_errors(samples)
         if abs(found["total"] - target) > 2 * found["standard_error"]["total"]:
             break
     return found
@@ -103,7 +103,7 @@ def _together(first: Samples, second: Samples) -> Samples:
     }
 
 
-def _estimate(samples: Samples) -> dict[str, Any]:
+def estimate_errors(samples: Samples) -> dict[str, Any]:
     """Relative L2 errors and standard errors."""
     names = dict.fromkeys(name for name, _ in samples)
     meshes = {name: relative([sample for (of, _), sample in samples.items() if of == name]) for name in names}

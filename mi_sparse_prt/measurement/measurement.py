@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
+import mitsuba as mi
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.scene.scene import Scene
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -17,38 +25,118 @@ class MeshRange:
     vertices: slice
 
 
+class SurfacePoints(NamedTuple):
+    """Where rows of T hold, in world space: (n, 3) float32 each.
+
+    Attributes
+    ----------
+    positions
+    normals
+        Shading normals: the cosine and the hemisphere.
+    ray_offsets
+        From a position to where its rays start, on the front of the surface.
+    """
+
+    positions: Floats
+    normals: Floats
+    ray_offsets: Floats
+
+
 @dataclass(frozen=True)
 class Measurement:
-    """Points for which rows of T hold.
+    """Points for which incident rows hold, and outputs made of them; by `mesh_vertices` or `camera_pixels`.
 
     Attributes
     ----------
     keys : (n,) uint64
-        Identify points whatever their order (``Points.keys``).
+        Identify points whatever their order: random numbers are made of them.
     areas : (n,) float32
         Of the surface around each point, world units.
     groups : tuple of MeshRange
         They follow each other.
+    kind : str
+        ``"vertices"`` or ``"pixels"``.
+    normalised : Points, optional
+        In the scene's normalised frame; None where the matrix came from a file without its scene.
+    frame : ((3,) float64, float), optional
+        Centre and scale of that frame: normalised = (world - centre) * scale.
+    scene_hash : str, optional
+        Of the scene that it is of.
+    albedo : (n, 3) float32, optional
+        Diffuse reflectance at the points; that of the scene's vertices if not given.
+    weights : (outputs, n) sparse float32, optional
+        Without it, each point is an output.
+    image : (height, width), optional
+        Of outputs that are pixels, row by row.
     """
 
     keys: NDArray[np.uint64]
-    areas: NDArray[np.float32]
+    areas: Floats
     groups: tuple[MeshRange, ...]
+    kind: str = "vertices"
+    normalised: Points | None = None
+    frame: tuple[NDArray[np.float64], float] | None = None
+    scene_hash: str | None = None
+    albedo: Floats | None = None
+    weights: scipy.sparse.csr_array | None = None
+    image: tuple[int, int] | None = None
 
     def __len__(self) -> int:
+        """Points."""
         return len(self.keys)
 
+    @property
+    def outputs(self) -> int:
+        """What is asked for: rows of T."""
+        return len(self) if self.weights is None else int(self.weights.shape[0])
+
+    @property
+    def points(self) -> SurfacePoints:
+        """Positions, normals and ray offsets, world space, for which the rows hold.
+
+        Raises
+        ------
+        PrtError
+            If the matrix came from a file without its scene.
+        """
+        if self.normalised is None or self.frame is None:
+            raise PrtError("these points were not kept in the file: load_transport(path, scene) has them")
+        points, (centre, scale) = self.normalised, self.frame
+        offset = mi.math.RayEpsilon * (1 + np.abs(points.positions).max(axis=1, keepdims=True)) / scale
+        world = points.positions / scale + centre
+        return SurfacePoints(
+            world.astype(np.float32), points.normals, (points.offset_normals * offset).astype(np.float32)
+        )
+
+    def combined(self, values: Floats) -> Floats:
+        """Outputs (outputs, ...) of values at all points (n, ...)."""
+        if self.weights is None:
+            return values
+        flat = self.weights @ values.reshape(len(values), -1)
+        return flat.reshape(-1, *values.shape[1:])
+
+    def spread(self, values: Floats) -> Floats:
+        """The transpose of ``combined``: (outputs, ...) to (n, ...)."""
+        if self.weights is None:
+            return values
+        flat = self.weights.T @ values.reshape(len(values), -1)
+        return flat.reshape(-1, *values.shape[1:])
+
     def take(self, points: NDArray[np.integer], groups: tuple[MeshRange, ...]) -> Measurement:
-        """Some points, in this order, which are in these groups."""
+        """Some points, in this order, which are in these groups; without weights."""
         return replace(self, keys=self.keys[points], areas=self.areas[points], groups=groups)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What files keep, beside ``attributes``."""
-        return {"keys": self.keys, "areas": self.areas}
+        own: dict[str, NDArray[Any]] = {"keys": self.keys, "areas": self.areas}
+        if self.weights is not None:
+            own |= {f"weights_{part}": getattr(self.weights, part) for part in ("data", "indices", "indptr")}
+        return own
 
     def attributes(self) -> dict[str, Any]:
         """JSON as it is."""
-        return {"groups": [[group.name, group.vertices.start, group.vertices.stop] for group in self.groups]}
+        groups = [[group.name, group.vertices.start, group.vertices.stop] for group in self.groups]
+        return {"kind": self.kind, "groups": groups, "image": self.image}
 
     @classmethod
     def from_arrays(cls, attributes: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Measurement:
@@ -57,4 +145,25 @@ class Measurement:
         keys, areas = arrays["keys"], arrays["areas"]
         if areas.shape != keys.shape or (groups and groups[-1].vertices.stop != len(keys)):
             raise ValueError("points and their areas do not fit together")
-        return cls(keys, areas, groups)
+        weights = None
+        if "weights_indptr" in arrays:
+            data, indices, indptr = (arrays[f"weights_{part}"] for part in ("data", "indices", "indptr"))
+            weights = scipy.sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, len(keys)))
+            weights.check_format(full_check=True)
+        image = attributes.get("image")
+        kind = attributes.get("kind", "vertices")
+        return cls(keys, areas, groups, kind, weights=weights, image=tuple(image) if image else None)
+
+
+def mesh_vertices(scene: Scene) -> Measurement:
+    """The vertices of a scene's meshes: each is an output."""
+    groups = tuple(MeshRange(mesh.name, mesh.vertices) for mesh in scene.meshes)
+    points = vertex_points(scene)
+    return Measurement(
+        points.keys,
+        scene.vertex_areas,
+        groups,
+        normalised=points,
+        frame=(scene.centre, scene.scale),
+        scene_hash=scene.hash,
+    )

@@ -19,19 +19,18 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 
 
-def exact_direct(solver: DirectSolver, scene: Scene, clock: Stopwatch, progress: bool) -> MethodResult:
+def exact_direct(solver: DirectSolver, clock: Stopwatch, progress: bool) -> MethodResult:
     """All direct light, phase ``direct``: bits, or in the texel basis the mean cosines of the solver's strata."""
     with clock.phase("direct"):
         stored = solver.row_storage(len(solver.points))
         _trace(solver, stored, solver.rows, "direct", progress)
     if solver.basis == "direction":
         part: Visibility | MeanCosine = Visibility(
-            stored.astype(np.uint32, copy=False), scene.normals, solver.lighting
+            stored.astype(np.uint32, copy=False), solver.points.normals, solver.lighting
         )
     else:
         part = MeanCosine(stored.astype(np.uint16, copy=False), solver.lighting)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import count_bits
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.brute_force import exact_direct, path_traced
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.huang2010 import huang2010_parts
@@ -43,14 +43,11 @@ class Execution:
     ----------
     problem : Problem
     direct : DirectSolver
-        At the scene's vertices.
+        At its points.
     settings : Settings
     indirect : bool
         Whether there is indirect light.
-    clock : Stopwatch
-    progress : bool
-    checkpoint_folder : path, optional
-        Where finished rows of indirect light are kept until all are.
+    run : Run
     """
 
     def __init__(
@@ -59,13 +56,11 @@ class Execution:
         direct: DirectSolver,
         settings: Settings,
         indirect: bool,
-        clock: Stopwatch,
-        progress: bool,
-        checkpoint_folder: str | Path | None = None,
+        run: Run,
     ) -> None:
         self._problem, self._scene, self._solver = problem, problem.scene, direct
         self._settings, self._any_indirect = settings, indirect
-        self._clock, self.progress, self._folder = clock, progress, checkpoint_folder
+        self._run, self._clock, self.progress = run, run.clock, run.progress
         self._direct: dict[str, MethodResult] = {}
 
     def parts(self, plan: Plan) -> MethodResult:
@@ -105,7 +100,7 @@ class Execution:
         return replace(light, direct=factored)
 
     def _exact(self) -> MethodResult:
-        return exact_direct(self._solver, self._scene, self._clock, self.progress)
+        return exact_direct(self._solver, self._clock, self.progress)
 
     def _consensus(self) -> MethodResult:
         state = by_consensus(self._scene, self._solver, self._clock)
@@ -116,7 +111,7 @@ class Execution:
     def _edges(self) -> MethodResult:
         """All texels' centres, and where visibility changes between these."""
         solver = DirectSolver(self._scene.normalised, self._solver.lighting, self._solver.points)
-        centres = exact_direct(solver, self._scene, self._clock, self.progress)
+        centres = exact_direct(solver, self._clock, self.progress)
         assert isinstance(centres.direct, Visibility)
         with self._clock.phase("edges"):
             part, rays = fractional_visibility(solver, centres.direct.bits)
@@ -126,6 +121,8 @@ class Execution:
         """With interreflections by finite elements."""
         if isinstance(light.direct, FactoredVisibility):
             return self._gathered_terms(plan, light, light.direct)
+        if self._problem.measurement.kind != "vertices":
+            return self._gathered_elsewhere(plan, light)
         solver, settings = self._solver, self._settings
         with self._clock.phase("gather_rays"):
             nodes = choose_nodes(self._scene, solver.points)
@@ -141,6 +138,24 @@ class Execution:
         with self._clock.phase("interreflection"):
             part = gather.indirect(light.direct, plan.tolerance)
         rays = light.rays | {"gather": gather.rays}
+        return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
+
+    def _gathered_elsewhere(self, plan: Plan, light: MethodResult) -> MethodResult:
+        """With interreflections at points that are no vertices: these know the light that surfaces send out."""
+        problem, settings = self._problem, self._settings
+        vertices = problem.at_vertices.points
+        solver = DirectSolver(self._scene.normalised, self._solver.lighting, vertices)
+        sources = exact_direct(solver, self._clock, self.progress)
+        with self._clock.phase("gather_rays"):
+            nodes = choose_nodes(self._scene, vertices)
+            before = settings.max_depth if settings.max_depth < 0 else settings.max_depth - 1
+            gather = RadiositySolver(
+                self._scene, solver.lighting, vertices, plan.rays, before, settings.seed, nodes
+            )
+        with self._clock.phase("interreflection"):
+            part = gather.seen_from(problem.points, sources.direct, plan.tolerance)
+        rays = light.rays | {"gather": gather.rays}
+        rays["direct"] += sources.rays["direct"]
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
 
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
@@ -184,13 +199,13 @@ class Execution:
 
     def _checkpoint(self, plan: Plan) -> Path | None:
         """A file name that stands for all that the rows of the indirect light, and their order, depend on."""
-        if self._folder is None:
+        if self._run.checkpoint_folder is None:
             return None
         state = (
             f"{self._scene.hash} {self._settings.of(plan)} {plan}".encode()
             + self._solver.points.keys.tobytes()
         )
-        return Path(self._folder) / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
+        return self._run.checkpoint_folder / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
 
 
 def _account(part: Gathered) -> dict[str, Any]:

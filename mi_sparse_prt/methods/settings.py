@@ -34,6 +34,7 @@ class Settings:
     strata: int = 2
     terms: int = 0
     harmonics: int | None = None
+    measurement: str = "vertices"
 
     def __post_init__(self) -> None:
         if isinstance(self.method, str) and self.method not in METHODS:
@@ -57,6 +58,11 @@ class Settings:
         if self.target_error is not None and not self.target_error > 0:
             raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
         self._check_terms()
+        if self.measurement == "pixels" and (self.view_dependent or self._needs_vertices):
+            raise PrtError(
+                f"method {self._name!r} and terms of glossy surfaces are for the vertices of meshes; at pixels leave "
+                'both out, or set method="gather" or "brute_force"'
+            )
         if self.coarse.resolution > self.resolution:
             raise PrtError(
                 f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
@@ -76,6 +82,11 @@ class Settings:
                 f"terms of glossy surfaces need one bit or share per texel, which method {self._name!r} does not give; "
                 'leave the method out, or set method="gather"'
             )
+
+    @property
+    def _needs_vertices(self) -> bool:
+        """Whether the method compares points with their neighbours on a mesh."""
+        return self.plan is not None and self.plan.direct in ("consensus", *TOGETHER)
 
     @property
     def view_dependent(self) -> bool:

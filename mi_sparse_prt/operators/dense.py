@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
@@ -62,5 +62,5 @@ class Dense(Operator):
         return {"values": self.values}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         return cls(arrays["values"])

@@ -10,7 +10,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.ragged import select_rows
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 
@@ -82,7 +82,7 @@ class Interpolated(Operator):
         return {"dense": self.dense, **sparse_to_arrays("weights", self.weights)}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         dense = arrays["dense"]
         return cls(dense, sparse_from_arrays("weights", arrays, dense.shape[0]))
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 _ELEMENTS = 1 << 15  # at a time
@@ -81,7 +81,7 @@ class LowRank(Operator):
         return {f"{name}_{c}": factor for name, factors in sides for c, factor in enumerate(factors)}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         left, right = (
             [arrays[f"{side}_{c}"] for c in range(3) if f"{side}_{c}" in arrays] for side in ("left", "right")
         )
@@ -89,7 +89,7 @@ class LowRank(Operator):
         if (
             len(left) not in (1, 3)
             or any(a.shape != (len(left[0]), len(b)) for a, b in pairs)
-            or any(b.shape[1] != lighting.n_directions for b in right)
+            or any(b.shape[1] != lighting.size for b in right)
         ):
             raise ValueError("factors of the indirect light do not fit together")
         return cls(tuple(left), tuple(right))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, bits_at
 from mi_sparse_prt.core.threads import run_overlapped
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 Ids = NDArray[np.integer]
 Floats = NDArray[np.float32]
@@ -64,7 +63,7 @@ class Operator(ABC):
 
     @classmethod
     @abstractmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: Any) -> Self:
         """From what ``arrays`` gave.
 
         Raises
@@ -178,7 +177,9 @@ class Operator(ABC):
             for c in range(channels):
                 result[some[0] : some[-1] + 1, c] = made[..., c] @ x
 
-        for _ in run_overlapped(partial(multiply, some, self.rows(some)) for some in self._blocks(CACHED_ROWS)):
+        for _ in run_overlapped(
+            partial(multiply, some, self.rows(some)) for some in self._blocks(CACHED_ROWS)
+        ):
             pass
         return result
 
@@ -262,7 +263,7 @@ class Masked(Operator):
         return {"operator": self.operator, "points": self.points, "open": self.open}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: Any) -> Self:
         return cls(arrays["operator"], arrays["points"], arrays["open"])
 
     def _kept(self, rows: Ids, texels: Ids) -> NDArray[np.bool_]:

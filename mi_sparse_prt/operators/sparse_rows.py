@@ -10,7 +10,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 
@@ -69,7 +69,7 @@ class SparseRows(Operator):
         return {name: array for channel in channels for name, array in channel.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         count = sum(name.endswith("_indptr") for name in arrays)
-        columns = lighting.n_directions
+        columns = lighting.size
         return cls(tuple(sparse_from_arrays(f"channel_{c}", arrays, columns) for c in range(count)))

@@ -6,7 +6,6 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
@@ -54,7 +53,7 @@ def operator_arrays(operator: Operator, name: str) -> tuple[dict[str, str], dict
 
 
 def operator_from_arrays(
-    name: str, kinds: dict[str, str], arrays: dict[str, NDArray[Any]], lighting: CubemapLighting
+    name: str, kinds: dict[str, str], arrays: dict[str, NDArray[Any]], lighting: Any
 ) -> Operator:
     """The operator that ``operator_arrays`` gave under this name.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits
-from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
@@ -70,7 +70,7 @@ class Sum(Operator):
         return {f"term_{i}": term for i, term in enumerate(self.terms)}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
+    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         return cls(tuple(arrays[f"term_{i}"] for i in range(len(arrays))))
 
 

@@ -143,7 +143,7 @@ class Ranking:
 
 def ladder(settings: Settings) -> Ladder:
     """The plan of a method; with a target error, from the coarsest of its plans on."""
-    if settings.plan is None:  # "auto" with terms of glossy surfaces, whose costs no pilot knows
+    if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
         direct = "exact" if settings.basis == "direction" else "edges"
         return Ladder([replace(plan, direct=direct) for plan in EFFORTS["gather"]])
     if settings.target_error is None or isinstance(settings.method, Plan):

@@ -69,7 +69,7 @@ def gather_matrix(
     counts, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32 if counts.sum() < NOTHING else np.int64)
     entries = values / np.float32(rays_per_vertex), columns, starts
-    return scipy.sparse.csr_array(entries, shape=(len(starting), len(points)))
+    return scipy.sparse.csr_array(entries, shape=(len(starting), scene.n_vertices))
 
 
 class Surfaces:

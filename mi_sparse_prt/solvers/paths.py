@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -179,28 +180,42 @@ class PathSolver:
         """One sample of the radiance that first rays find on other surfaces, per d_omega."""
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
         if self.basis == "direction":
-            return _reflected(self.scene, ray, Light(self._texels.centre(texel), mi.Float(1)), rng, bounces)
+            return trace_reflected(
+                self.scene, ray, Light(distant(self._texels.centre(texel), mi.Float(1))), rng, bounces
+            )
         # Radiance 1 over the texel: each path sees its own direction in it, weighted to 1 on average.
         direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
         mean = self._texels.solid_angle(texel)
-        light = Light(direction, solid_angle / mean)
+        light = Light(distant(direction, solid_angle / mean))
         if has_mirrors(self.scene):
-            light = Light(direction, solid_angle / mean, lambda d: self._texels.contains(texel, d), 1 / mean)
-        return _reflected(self.scene, ray, light, rng, bounces)
+            inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
+            light = Light(distant(direction, solid_angle / mean), inside, 1 / mean)
+        return trace_reflected(self.scene, ray, light, rng, bounces)
 
 
 @dataclass
 class Light:
-    """The light of one element: irradiance (perpendicular) from one direction, for all surfaces but mirrors.
+    """The light of one element, as surfaces on the way of a path receive it.
 
-    A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths that
-    leave the scene right after one collect ``radiance`` if they leave towards the light (``contains``).
+    Attributes
+    ----------
+    sample : callable
+        Of an interaction (its ``p`` in the frame of the scene) and the random numbers of a path: a direction, the
+        irradiance at right angles to it, and how far a shadow ray goes, None for ever.
+    contains : callable, optional
+        A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths
+        that leave the scene right after one collect ``radiance`` if they leave towards the light.
+    radiance : Float, optional
     """
 
-    direction: mi.Vector3f
-    irradiance: mi.Float
+    sample: Callable[[Any, Any], tuple[Any, Any, Any]]
     contains: Callable[[mi.Vector3f], mi.Mask] | None = None
     radiance: mi.Float | None = None
+
+
+def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
+    """The same direction everywhere."""
+    return lambda si, rng: (direction, irradiance, None)
 
 
 def has_mirrors(scene: mi.Scene) -> bool:
@@ -209,7 +224,9 @@ def has_mirrors(scene: mi.Scene) -> bool:
 
 
 @dr.syntax
-def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32) -> mi.Color3f:
+def trace_reflected(
+    scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
+) -> mi.Color3f:
     """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
 
     Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most.
@@ -227,20 +244,24 @@ def _reflected(scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, boun
             result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
         active &= si.is_valid() & (depth < bounces)
 
-        # Light from its one direction
+        # Light, from one direction
+        towards, irradiance, reach = light.sample(si, rng)
         bsdf = si.bsdf(ray)
         value, _, sample, weight = bsdf.eval_pdf_sample(
             context,
             si,
-            si.to_local(light.direction),
+            si.to_local(towards),
             rng.next_float32(),
             mi.Point2f(rng.next_float32(), rng.next_float32()),
             active,
         )
         # NaN is lit, so that it is noticed, and what factored BSDFs make negative
         lit = active & ~dr.all(value == 0)
-        lit &= ~scene.ray_test(si.spawn_ray(light.direction), lit)
-        result += dr.select(lit, throughput * value * light.irradiance, 0)
+        shadow = si.spawn_ray(towards)
+        if reach is not None:
+            shadow.maxt = reach
+        lit &= ~scene.ray_test(shadow, lit)
+        result += dr.select(lit, throughput * value * irradiance, 0)
 
         # Next surface
         depth += 1

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from typing import Any
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
-from mi_sparse_prt.measurement.vertices import Points, vertex_points
-from mi_sparse_prt.reflection.reflection import Reflection
+from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
 from mi_sparse_prt.scene.scene import Scene
 
 
@@ -19,34 +18,44 @@ class Problem:
     Attributes
     ----------
     scene : Scene
-    emission : CubemapLighting
+    emission : EmissionSpace
         E: its columns.
+    measurement : Measurement
+        M: its points, not from a file.
     reflection : Reflection
-        R: what its points do with incident light.
+        R: what these do with incident light.
     basis : {"direction", "texel"}
-        How the light of a column arrives.
+        How the light of a column arrives, if that is a cubemap's texel.
     max_depth : int
         As Mitsuba's ``path``: 2 = direct light only, 5 = three interreflections, -1 = no limit.
     """
 
     scene: Scene
-    emission: CubemapLighting
+    emission: Any
+    measurement: Measurement
     reflection: Reflection
     basis: str = "direction"
     max_depth: int = 5
 
-    @cached_property
-    def points(self) -> Points:
-        """M: where its rows hold, in the scene's normalised frame."""
-        return vertex_points(self.scene)
-
     @property
-    def measurement(self) -> Measurement:
-        """M, as the result keeps it."""
-        groups = tuple(MeshRange(mesh.name, mesh.vertices) for mesh in self.scene.meshes)
-        return Measurement(self.points.keys, self.scene.vertex_areas, groups)
+    def points(self) -> Points:
+        """Where rows hold, in the scene's normalised frame."""
+        assert self.measurement.normalised is not None
+        return self.measurement.normalised
 
     @property
     def channels(self) -> int:
         """1 in a grey scene, else 3."""
         return 1 if self.scene.grey else 3
+
+    @property
+    def at_vertices(self) -> Problem:
+        """The same at the vertices, which know the light that surfaces send out."""
+        if self.measurement.kind == "vertices":
+            return self
+        return replace(self, measurement=mesh_vertices(self.scene), reflection=Diffuse(self.scene.albedo))
+
+
+def diffuse_problem(scene: Scene, emission: Any, max_depth: int = 5) -> Problem:
+    """At the vertices of a scene whose surfaces are all taken for diffuse, in the direction basis."""
+    return Problem(scene, emission, mesh_vertices(scene), Diffuse(scene.albedo), max_depth=max_depth)

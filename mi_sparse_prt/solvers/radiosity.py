@@ -83,7 +83,7 @@ class FiniteElements:
         albedo: Floats,
         keys: NDArray[np.uint64],
         nodes: Nodes,
-        contacts: Contacts,
+        contacts: Contacts | None,
         max_depth: int,
         seed: int,
     ) -> None:
@@ -116,6 +116,20 @@ class FiniteElements:
             result[:, part] = np.stack([self.nodes.spread(total) for total in totals], axis=-1)
         return result
 
+    def apply_coloured(self, columns: Floats) -> Floats:
+        """Indirect light (n_v, k, 3) under a few coloured lights (n_v, k, 3), without approximation."""
+        result = np.zeros_like(columns)
+        count = self.bounces(columns.sum(axis=1).max(axis=1))
+        for c in range(3 if count else 0):
+            rho = self._albedo[min(c, self.channels - 1)][None]
+            light = multiply_scaled(self.matrix, rho, np.ascontiguousarray(columns[..., c]))[0]
+            total = light.copy()
+            for _ in range(count - 1):
+                light = multiply_scaled(self.matrix, rho, self.nodes.spread(light))[0]
+                total += light
+            result[..., c] = self.nodes.spread(total)
+        return result
+
     def rows(self, direct: Operator, ids: NDArray[np.integer]) -> Floats:
         """Indirect light of a few vertices, without approximation: bounces in reverse ([Leh07] 2.6).
 
@@ -130,7 +144,7 @@ class FiniteElements:
         (k, n_directions, channels) float32
             White indirect transport.
         """
-        direct = self.contacts.lit(direct)
+        direct = self._lit(direct)
         count = self._count_for(direct)
         totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
         result = np.empty((len(ids), direct.shape[1], self.channels), np.float32)
@@ -167,7 +181,7 @@ class FiniteElements:
         -------
         Gathered
         """
-        direct = self.contacts.lit(direct)
+        direct = self._lit(direct)
         count = self._count_for(direct)
         if count == 0:
             left = np.zeros((self._albedo.shape[1], 0), np.float32)
@@ -197,6 +211,10 @@ class FiniteElements:
             for total, i, x in zip(totals, at, light, strict=True):
                 total[:, i] += x
         return totals
+
+    def _lit(self, direct: Operator) -> Operator:
+        """Direct light without what vertices in touch with other surfaces see behind these."""
+        return direct if self.contacts is None else self.contacts.lit(direct)
 
     def _count_for(self, direct: Operator) -> int:
         return self.bounces(direct.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0])
@@ -257,7 +275,8 @@ class RadiositySolver(FiniteElements):
     Parameters
     ----------
     scene : Scene
-    lighting : CubemapLighting
+    lighting : CubemapLighting, optional
+        Without it, nothing is looked at where surfaces touch.
     points : Points
         Of all vertices (``vertex_points``).
     rays_per_vertex : int
@@ -291,7 +310,7 @@ class RadiositySolver(FiniteElements):
     def __init__(
         self,
         scene: Scene,
-        lighting: CubemapLighting,
+        lighting: CubemapLighting | None,
         points: Points,
         rays_per_vertex: int = 256,
         max_depth: int = 5,
@@ -305,11 +324,38 @@ class RadiositySolver(FiniteElements):
             np.ascontiguousarray(scene.albedo.T[: 1 if scene.grey else 3]),
             points.keys,
             nodes,
-            contacts(scene, lighting),
+            contacts(scene, lighting) if lighting else None,
             max_depth,
             seed,
         )
         self.rays = len(nodes) * rays_per_vertex
+        self._scene, self._rays_per_vertex = scene, rays_per_vertex
+
+    def seen_from(self, points: Points, direct: Operator, tolerance: float) -> Gathered:
+        """Indirect light at points that are no vertices, from direct light of the vertices: F (V_p + G_p ...).
+
+        Parameters
+        ----------
+        points : Points
+        direct : Operator
+            Of the vertices.
+        tolerance : float
+            As for ``indirect``; ``max_depth`` counts from the points.
+        """
+        matrix = gather_matrix(self._scene, points, self._rays_per_vertex, self.seed)
+        self.rays += len(points) * self._rays_per_vertex
+        lit = self._lit(direct)
+        first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed)
+        before = self.indirect(direct, tolerance)  # what vertices receive, one bounce before
+        again = [
+            multiply_scaled(matrix, rho[None], x)[0] for rho, x in zip(self._albedo, before.left, strict=True)
+        ]
+        return Gathered(
+            tuple(np.hstack(pair) for pair in zip(first.left, again, strict=True)),
+            tuple(np.vstack(pair) for pair in zip(first.right, before.right, strict=True)),
+            first.left_out,
+            before.bounces + 1,
+        )
 
 
 def _energies(x: Floats) -> NDArray[np.float64]:

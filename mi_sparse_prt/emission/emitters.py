@@ -1,0 +1,163 @@
+"""The scene's own emitters as a basis of light: a column for each, or for each group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.scene import Scene
+
+
+class SceneEmitters:
+    """Lamps that are turned on and off, dimmed and coloured: column j is the scene lit by the j-th alone, as authored.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its area lights, spots, points, directional lights and environment.
+    groups : mapping of str to sequence of str, optional
+        Names of the emitters that one column stands for: that of the shape of an area light, the id of another.
+        Emitters that no group names stay dark. Without groups, each emitter is a column.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the columns.
+
+    Raises
+    ------
+    PrtError
+        If the scene has no emitter, or none of a name.
+    """
+
+    kind: ClassVar[str] = "emitters"
+
+    def __init__(self, scene: Scene, groups: Mapping[str, Sequence[str]] | None = None) -> None:
+        self._scene = scene.mitsuba
+        known = _emitter_names(scene)
+        if not known:
+            raise PrtError(
+                f"the scene {scene.path or ''} has no emitters: add an area light, a point, a spot ..."
+            )
+        chosen = {name: [name] for name in known} if groups is None else dict(groups)
+        for group, members in chosen.items():
+            for name in members:
+                if name not in known:
+                    raise PrtError(
+                        f"group {group!r} names the emitter {name!r}; the scene has: {', '.join(known)}"
+                    )
+            if not members:
+                raise PrtError(f"group {group!r} names no emitter; the scene has: {', '.join(known)}")
+        self.names = tuple(chosen)
+        numbers = [[known[name] for name in members] for members in chosen.values()]
+        lengths = [len(members) for members in numbers]
+        self._first = mi.UInt32(np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.uint32))
+        self._count = mi.UInt32(np.array(lengths, np.uint32))
+        self._emitters = mi.UInt32(np.concatenate(numbers).astype(np.uint32))
+        group_of = np.full(max(known.values()) + 1, -1)
+        for j, own in enumerate(numbers):
+            group_of[own] = j
+        self._group_of = mi.Int32(group_of.astype(np.int32))
+
+    @property
+    def size(self) -> int:
+        """Columns."""
+        return len(self.names)
+
+    def __repr__(self) -> str:
+        return f"SceneEmitters({', '.join(self.names)})"
+
+    def project(self, light: Any) -> NDArray[np.float32]:
+        """How bright each lamp is, relative to its own radiance: (size, 3).
+
+        Parameters
+        ----------
+        light : mapping of names to numbers or RGB triples, or (size,) or (size, 3) floats, or a number
+            Lamps that a mapping does not name are off.
+
+        Raises
+        ------
+        PrtError
+            If a name is unknown, the shape another, or a value not finite.
+        """
+        if isinstance(light, Mapping):
+            for name in light:
+                if name not in self.names:
+                    raise PrtError(f"there is no lamp {name!r}; there are: {', '.join(self.names)}")
+            rows = [np.broadcast_to(np.asarray(light.get(name, 0.0), np.float32), 3) for name in self.names]
+            values = np.stack(rows)
+        else:
+            values = np.asarray(light, np.float32)
+            if values.shape in ((), (self.size,)):
+                values = np.broadcast_to(values[..., None], (self.size, 3))
+        if values.shape != (self.size, 3):
+            raise PrtError(
+                f"light has shape {values.shape}; {self!r} takes ({self.size}, 3), or names with values"
+            )
+        if not np.isfinite(values).all():
+            raise PrtError("light has values that are NaN or infinite; repair it")
+        return np.ascontiguousarray(values)
+
+    def sample(
+        self, element: mi.UInt32, position: mi.Point3f, uv: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+        """One direction in which light of an element arrives, see ``EmissionSpace.sample``."""
+        count = dr.gather(mi.UInt32, self._count, element)
+        u = uv.x * mi.Float(count)
+        which = dr.minimum(mi.UInt32(u), count - 1)
+        number = dr.gather(mi.UInt32, self._emitters, dr.gather(mi.UInt32, self._first, element) + which)
+        emitter = dr.gather(mi.EmitterPtr, self._scene.emitters_dr(), number)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
+        si.p = position
+        found, weight = emitter.sample_direction(si, mi.Point2f(u - mi.Float(which), uv.y), mi.Mask(True))
+        return found.d, mi.Color3f(weight) * mi.Float(count), found.dist
+
+    def element_of(self, si: mi.SurfaceInteraction3f, active: mi.Mask) -> tuple[mi.Int32, mi.Color3f]:
+        """The element whose light rays meet, -1 for none, and its radiance along them."""
+        emitter = si.emitter(self._scene, active)
+        numbers = dr.reinterpret_array(mi.UInt32, self._scene.emitters_dr()).numpy()
+        table = np.full(int(numbers.max()) + 1, -1)
+        table[numbers] = np.arange(len(numbers))
+        known = active & (emitter != None)  # noqa: E711 - an array of pointers
+        number = dr.gather(mi.Int32, mi.Int32(table), dr.reinterpret_array(mi.UInt32, emitter), known)
+        known &= (number >= 0) & (number < len(self._group_of))
+        group = dr.select(known, dr.gather(mi.Int32, self._group_of, mi.UInt32(number), known), -1)
+        return group, dr.select(known, mi.Color3f(emitter.eval(si, known)), 0)
+
+    def attributes(self) -> dict[str, Any]:
+        return {"names": list(self.names)}
+
+
+class StoredEmitters:
+    """Lamps of a matrix that came from a file: their names, and no scene."""
+
+    kind: ClassVar[str] = "emitters"
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+
+    size = SceneEmitters.size
+    project = SceneEmitters.project
+    attributes = SceneEmitters.attributes
+    __repr__ = SceneEmitters.__repr__
+
+
+def _emitter_names(scene: Scene) -> dict[str, int]:
+    """Numbers of all emitters by name: the mesh's, or the emitter's own id."""
+    numbers = dr.reinterpret_array(mi.UInt32, scene.mitsuba.emitters_dr()).numpy().tolist()
+    on_shapes = {
+        int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter())).numpy()[0]): mesh.name
+        for shape, mesh in zip(scene.mitsuba.shapes(), scene.meshes, strict=True)
+        if shape.is_emitter()
+    }
+    names: dict[str, int] = {}
+    for k, (number, emitter) in enumerate(zip(numbers, scene.mitsuba.emitters(), strict=True)):
+        name = on_shapes.get(number) or emitter.id() or f"emitter_{k}"
+        names[name if name not in names else f"{name}_{k}"] = k
+    return names

@@ -1,0 +1,109 @@
+"""Few columns of coloured light, such as lamps: direct light by samples, interreflections without approximation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.core.sparse_product import multiply_scaled
+from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.operators.dense import Dense
+from mi_sparse_prt.operators.operator import Floats
+from mi_sparse_prt.solvers.form_factors import gather_matrix
+from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
+
+BLOCK = 4096  # points at a time
+
+
+def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 8) -> MethodResult:
+    """By finite elements: diffuse scenes.
+
+    Parameters
+    ----------
+    problem : Problem
+        With lamps.
+    run : Run
+    rays : int
+        Per vertex and per point, that gather indirect light; a power of two.
+    strata : int
+        strata**2 shadow rays per point and lamp.
+    """
+    sources = problem.at_vertices
+    direct = _direct(problem, run, strata)
+    own = direct if sources is problem else _direct(sources, run, strata)
+    indirect, traced = None, 0
+    if problem.max_depth != 2:
+        with run.clock.phase("gather_rays"):
+            depth = (
+                problem.max_depth if sources is problem or problem.max_depth < 0 else problem.max_depth - 1
+            )
+            solver = RadiositySolver(problem.scene, None, sources.points, rays, depth, run.seed)
+        with run.clock.phase("interreflection"):
+            indirect = solver.apply_coloured(own) if depth != 2 else np.zeros_like(own)
+            traced = solver.rays
+            if sources is not problem:
+                indirect = _seen_from(problem, own + indirect, rays, run.seed)
+                traced += len(problem.points) * rays
+    return _result(problem, direct, indirect, {"direct": direct[..., 0].size * strata**2, "gather": traced})
+
+
+def path_traced_lamps(problem: Problem, run: Run, spp: int = 64, strata: int = 8) -> MethodResult:
+    """By path tracing: any BSDF."""
+    direct = _direct(problem, run, strata)
+    indirect = None
+    if problem.max_depth != 2:
+        with run.clock.phase("indirect"):
+            solver, m = LampPaths(problem, spp, run.seed), problem.emission.size
+            indirect = np.zeros_like(direct)
+            size = max(1, solver.block_elements // m)
+            for ids in _blocks(len(direct), size, "indirect", run):
+                found = solver.elements(np.repeat(ids, m), np.tile(np.arange(m), len(ids)))
+                indirect[ids] = found.mean.reshape(len(ids), m, 3)
+    elements = direct[..., 0].size
+    rays = {"direct": elements * strata**2, "indirect_paths": 0 if indirect is None else elements * spp}
+    return _result(problem, direct, indirect, rays)
+
+
+def _direct(problem: Problem, run: Run, strata: int) -> Floats:
+    """Unit-albedo direct light (n, m, 3)."""
+    solver = LampRays(problem, strata, run.seed)
+    with run.clock.phase("direct"):
+        result = np.empty((len(problem.points), problem.emission.size, 3), np.float32)
+        for ids in _blocks(len(result), BLOCK, "direct", run):
+            result[ids] = solver.rows(ids)
+    return result
+
+
+def _seen_from(problem: Problem, light: Floats, rays: int, seed: int) -> Floats:
+    """Indirect light (n, m, 3) of points that are no vertices, from light (n_v, m, 3) that vertices receive."""
+    matrix = gather_matrix(problem.scene, problem.points, rays, seed)
+    albedo = np.ascontiguousarray(problem.scene.albedo.T)
+    channels = [
+        multiply_scaled(matrix, albedo[c : c + 1], np.ascontiguousarray(light[..., c]))[0] for c in range(3)
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def _blocks(count: int, size: int, name: str, run: Run) -> Any:
+    """Numbers of points, some at a time, with a progress bar."""
+    with tqdm(total=count, desc=name, unit=" rows", disable=not run.progress) as bar:
+        for a in range(0, count, size):
+            ids = np.arange(a, min(a + size, count))
+            yield ids
+            bar.update(len(ids))
+
+
+def _result(problem: Problem, direct: Floats, indirect: Floats | None, rays: dict[str, int]) -> MethodResult:
+    elements = direct[..., 0].size
+    return MethodResult(
+        Dense(direct),
+        None if indirect is None else Dense(indirect),
+        elements,
+        {"direct": elements, "indirect": 0 if indirect is None else elements},
+        rays,
+    )

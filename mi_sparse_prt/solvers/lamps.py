@@ -1,0 +1,131 @@
+"""Light of a few columns, such as lamps: their direct light by samples, and what surfaces make of it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.emission.emitters import SceneEmitters
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, trace_reflected
+from mi_sparse_prt.solvers.problem import Problem
+
+LANES = 1 << 22  # rays per wavefront
+
+Floats = NDArray[np.float32]
+
+
+class LampRays:
+    """Unit-albedo direct light of lamps at points, by shadow rays to samples of them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose emission space is sampled.
+    strata : int
+        Per axis of a lamp: strata**2 rays per element, each at a random place of its stratum.
+    seed : int
+    """
+
+    def __init__(self, problem: Problem, strata: int = 8, seed: int = 0) -> None:
+        self._emission: SceneEmitters = problem.emission
+        self._scene, self._strata, self._seed = problem.scene, strata, seed
+        self._points = PointArrays(problem.points)
+
+    @property
+    def rays_per_element(self) -> int:
+        """Shadow rays of one element."""
+        return self._strata**2
+
+    def elements(
+        self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int | None = None
+    ) -> Estimate:
+        """Irradiance / pi of listed elements: mean (m, 3) and the variance of that mean, strata left out of account."""
+        size, n = max(1, LANES // self.rays_per_element), len(point_ids)
+        mean, variance = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+        for a in range(0, n, size):
+            part = slice(a, a + size)
+            points, lamps = mi.UInt32(point_ids[part]), mi.UInt32(columns[part])
+            found = self._samples(points, lamps, self._seed if seed is None else seed)
+            powers = [x * x for x in found]
+            dr.eval(found, powers)
+            sums, squares = (
+                np.stack(
+                    [dr.block_reduce(dr.ReduceOp.Add, x, self.rays_per_element).numpy() for x in xs], axis=1
+                )
+                / self.rays_per_element
+                for xs in (found, powers)
+            )
+            mean[part] = sums
+            variance[part] = np.maximum(squares - sums**2, 0) / max(self.rays_per_element - 1, 1)
+        return Estimate(mean, variance)
+
+    def rows(self, point_ids: NDArray[np.integer]) -> Floats:
+        """Whole rows (k, size, 3)."""
+        m = self._emission.size
+        found = self.elements(np.repeat(point_ids, m), np.tile(np.arange(m), len(point_ids)))
+        return found.mean.reshape(len(point_ids), m, 3)
+
+    def _samples(self, points: mi.UInt32, lamps: mi.UInt32, seed: int) -> list[mi.Float]:
+        """One value per channel and ray, rays of an element side by side."""
+        lane = dr.arange(mi.UInt32, len(points) * self.rays_per_element)
+        element = lane // self.rays_per_element
+        stratum = lane - element * self.rays_per_element
+        point, lamp = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, lamps, element)
+        rng = random_generator(self._points.key(point), lamp, stratum, seed)
+        row = stratum // self._strata
+        uv = mi.Point2f(
+            (mi.Float(stratum - row * self._strata) + rng.next_float32()) / self._strata,
+            (mi.Float(row) + rng.next_float32()) / self._strata,
+        )
+        position = to_world(self._scene, self._points.position(point))
+        direction, irradiance, distance = self._emission.sample(lamp, position, uv)
+        cosine = dr.dot(self._points.normal(point), direction)
+        lit = (cosine > 0) & (dr.max(irradiance) > 0)
+        ray = start_ray(self._points, point, direction)
+        ray.maxt = shadow_length(self._scene, distance)
+        lit &= ~self._scene.normalised.ray_test(ray, lit)
+        value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0)
+        return [value.x, value.y, value.z]
+
+
+class LampPaths(PathSolver):
+    """Indirect light of lamps at points, by path tracing: elements (m, 3), times 1 rather than per solid angle.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose emission space is sampled.
+    spp, seed : int
+        As for ``PathSolver``.
+    """
+
+    def __init__(self, problem: Problem, spp: int = 64, seed: int = 0) -> None:
+        self.scene, self.points, self.spp, self.seed = problem.scene.normalised, problem.points, spp, seed
+        self.max_depth, self.channels = problem.max_depth, 3
+        self._world, self._emission = problem.scene, problem.emission
+        self._points = PointArrays(problem.points)
+
+    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
+        bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
+
+        def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+            uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+            direction, irradiance, distance = self._emission.sample(texel, to_world(self._world, si.p), uv)
+            return direction, irradiance, shadow_length(self._world, distance)
+
+        return trace_reflected(self.scene, ray, Light(sample), rng, bounces)
+
+
+def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:
+    """Points of the normalised frame in world space."""
+    return p / scene.scale + mi.Point3f(*map(float, scene.centre))
+
+
+def shadow_length(scene: Scene, distance: mi.Float) -> mi.Float:
+    """How far shadow rays go in the normalised frame: nearly to the light, as Mitsuba's do."""
+    return distance * (scene.scale * (1 - mi.math.ShadowEpsilon))
