@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError

@@ -20,7 +20,7 @@ from mi_sparse_prt.solvers.radiosity import RadiositySolver
 BLOCK = 4096  # points at a time
 
 
-def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 8) -> MethodResult:
+def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16) -> MethodResult:
     """By finite elements: diffuse scenes.
 
     Parameters
@@ -52,7 +52,7 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 8)
     return _result(problem, direct, indirect, {"direct": direct[..., 0].size * strata**2, "gather": traced})
 
 
-def path_traced_lamps(problem: Problem, run: Run, spp: int = 64, strata: int = 8) -> MethodResult:
+def path_traced_lamps(problem: Problem, run: Run, spp: int = 64, strata: int = 16) -> MethodResult:
     """By path tracing: any BSDF."""
     direct = _direct(problem, run, strata)
     indirect = None

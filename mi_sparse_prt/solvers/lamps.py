@@ -31,7 +31,7 @@ class LampRays:
     seed : int
     """
 
-    def __init__(self, problem: Problem, strata: int = 8, seed: int = 0) -> None:
+    def __init__(self, problem: Problem, strata: int = 16, seed: int = 0) -> None:
         self._emission: SceneEmitters = problem.emission
         self._scene, self._strata, self._seed = problem.scene, strata, seed
         self._points = PointArrays(problem.points)
