@@ -67,7 +67,7 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
     if emission["kind"] == "cubemap":
         lighting: EmissionSpace = CubemapLighting(emission["resolution"])
     elif emission["kind"] == "emitters":
-        lighting = StoredEmitters(emission["names"])
+        lighting = StoredEmitters(emission["groups"])
     else:
         raise PrtError(
             f"{path} has the emission space {emission['kind']!r}, which is unknown here; upgrade the package"

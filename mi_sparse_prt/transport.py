@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.emitters import StoredEmitters
 from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.io.store import write_store
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
@@ -254,6 +255,8 @@ class LightTransport:
         PrtError
             If the matrix belongs to another scene.
         """
+        if isinstance(self.emission, StoredEmitters):
+            return replace(self, emission=self.emission.of_scene(scene)).for_scene(scene)
         if self.measurement.kind != "vertices":
             check_scene(self.scene_hash, scene)
             return self

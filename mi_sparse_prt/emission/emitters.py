@@ -29,6 +29,8 @@ class SceneEmitters:
     ----------
     names : tuple of str
         Of the columns.
+    groups : dict of str to list of str
+        The emitters of each.
 
     Raises
     ------
@@ -54,6 +56,7 @@ class SceneEmitters:
                     )
             if not members:
                 raise PrtError(f"group {group!r} names no emitter; the scene has: {', '.join(known)}")
+        self.groups = {name: list(members) for name, members in chosen.items()}
         self.names = tuple(chosen)
         numbers = [[known[name] for name in members] for members in chosen.values()]
         lengths = [len(members) for members in numbers]
@@ -131,16 +134,27 @@ class SceneEmitters:
         return group, dr.select(known, mi.Color3f(emitter.eval(si, known)), 0)
 
     def attributes(self) -> dict[str, Any]:
-        return {"names": list(self.names)}
+        return {"groups": self.groups}
 
 
 class StoredEmitters:
-    """Lamps of a matrix that came from a file: their names, and no scene."""
+    """Lamps of a matrix that came from a file: their names, and no scene.
+
+    Parameters
+    ----------
+    groups : dict of str to list of str
+        As for ``SceneEmitters``.
+    """
 
     kind: ClassVar[str] = "emitters"
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
+    def __init__(self, groups: dict[str, list[str]]) -> None:
+        self.groups = groups
+        self.names = tuple(groups)
+
+    def of_scene(self, scene: Scene) -> SceneEmitters:
+        """The lamps of a scene that have these names."""
+        return SceneEmitters(scene, self.groups)
 
     size = SceneEmitters.size
     project = SceneEmitters.project

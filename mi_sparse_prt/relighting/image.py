@@ -12,6 +12,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.emitters import SceneEmitters
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -38,14 +39,22 @@ class RelitScene:
         Irradiance / pi at the vertices: ``LightTransport.irradiance``.
     background : mi.Emitter or None
         What rays see that leave the scene.
+    lamps : (SceneEmitters, (size, 3) float32), optional
+        Emitters of the scene that are seen themselves, and how bright they are.
 
     Notes
     -----
     Only the side of a surface that its normals point to has light; the other side is black.
     """
 
-    def __init__(self, scene: Scene, irradiance: NDArray[np.float32], background: mi.Emitter | None) -> None:
-        self._scene, self._background = scene.mitsuba, background
+    def __init__(
+        self,
+        scene: Scene,
+        irradiance: NDArray[np.float32],
+        background: mi.Emitter | None,
+        lamps: tuple[SceneEmitters, NDArray[np.float32]] | None = None,
+    ) -> None:
+        self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
@@ -61,6 +70,10 @@ class RelitScene:
         value = dr.select(front, self._shaded(si, self._hit_corners(hit, valid), valid), 0)
         if self._background is not None:
             value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
+        if self._lamps is not None:
+            emitters, brightness = self._lamps
+            lamp, radiance = emitters.element_of(si, active)
+            value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
         return value, valid
 
     def _hit_corners(self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask) -> list[Corner]:
@@ -196,7 +209,7 @@ def render(
         The scene of the matrix.
     transport : LightTransport
     environment : Environment, emitter or (n_directions, 3) float
-        The light; also the background.
+        The light; also the background. Of a matrix of lamps, how bright these are (``SceneEmitters.project``).
     sensor : int or mi.Sensor
         One of ``scene.mitsuba.sensors()``, or any other.
     spp : int
@@ -221,11 +234,33 @@ def render(
                 f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
             )
         sensor = sensors[sensor]
-    background = background_emitter(environment, transport.lighting)
-    if transport.terms:
-        relit: RelitScene = GlossyRelitScene(scene, transport, environment, background)
+    transport = transport.for_scene(scene)
+    at_pixels = transport.measurement.image
+    if at_pixels is not None and at_pixels != tuple(int(n) for n in sensor.film().crop_size())[::-1]:
+        raise PrtError(
+            f"this matrix has the pixels of another camera: {at_pixels[1]} x {at_pixels[0]}; give that one"
+        )
+    image = _rendered(scene, sensor, _relit_scene(scene, transport, environment), spp, seed, progress)
+    return image if at_pixels is None else image + transport.relight(environment).reshape(image.shape)
+
+
+def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> RelitScene:
+    """What a camera sees: of a matrix of pixels nothing but the lights themselves, of others the surfaces, too."""
+    if isinstance(transport.emission, SceneEmitters):
+        background, lamps = None, (transport.emission, transport.emission.project(environment))
     else:
-        relit = RelitScene(scene, transport.for_scene(scene).irradiance(environment), background)
+        background, lamps = background_emitter(environment, transport.lighting), None
+    if transport.terms:
+        return GlossyRelitScene(scene, transport, environment, background)
+    dark = transport.measurement.kind != "vertices"
+    irradiance = np.zeros((scene.n_vertices, 3), np.float32) if dark else transport.irradiance(environment)
+    return RelitScene(scene, irradiance, background, lamps)
+
+
+def _rendered(
+    scene: Scene, sensor: mi.Sensor, relit: RelitScene, spp: int, seed: int, progress: bool
+) -> NDArray[np.float32]:
+    """The image, by some samples per pixel at a time."""
     integrator = RelitIntegrator(relit)
     passes = []
     with tqdm(total=spp, desc="render", unit=" spp", disable=not progress) as bar:

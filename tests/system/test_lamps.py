@@ -1,0 +1,224 @@
+"""The scene's own emitters as columns: what Mitsuba's ``path`` renders with them, one at a time and all together."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.core.metrics import relative_l2_without_noise
+from mi_sparse_prt.measurement.vertices import sensor_points
+
+DEPTH = 4
+T = mi.ScalarTransform4f
+
+
+def room(lit: tuple[str, ...] = ("lamp", "bulb", "beam", "sky")) -> mi.Scene:
+    """Three walls, a floor and a ball under an area light, a point, a spot and a constant sky, those that are lit."""
+
+    def wall(axis: list[float], angle: float, place: list[float], colour: list[float]) -> dict:
+        return {
+            "type": "rectangle",
+            "to_world": T().translate(place).rotate(axis, angle),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}},
+        }
+
+    lamp = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0.9, 0]).rotate([1, 0, 0], 90).scale(0.3),
+        "bsdf": {"type": "diffuse", "reflectance": 0.2},
+    }
+    if "lamp" in lit:
+        lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": [8, 7, 5]}}
+    others = {
+        "bulb": {
+            "type": "point",
+            "position": [-0.5, 0.2, 0.3],
+            "intensity": {"type": "rgb", "value": [0.2, 0.3, 1.0]},
+        },
+        "beam": {
+            "type": "spot",
+            "to_world": T().look_at([0.5, 0.9, 0.8], [0.2, -0.6, 0], [0, 1, 0]),
+            "intensity": {"type": "rgb", "value": [1, 0.3, 0.3]},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.1, 0.12]}},
+    }
+    camera = {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": T().look_at([0, 0, 3.5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 48, "height": 48},
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": wall([1, 0, 0], -90, [0, -1, 0], [0.7, 0.7, 0.7]),
+            "back": wall([1, 0, 0], 0, [0, 0, -1], [0.7, 0.7, 0.7]),
+            "left": wall([0, 1, 0], 90, [-1, 0, 0], [0.7, 0.1, 0.1]),
+            "right": wall([0, 1, 0], -90, [1, 0, 0], [0.1, 0.6, 0.1]),
+            "ball": {
+                "type": "sphere",
+                "center": [0.2, -0.6, 0],
+                "radius": 0.4,
+                "bsdf": {"type": "diffuse", "reflectance": 0.5},
+            },
+            "panel": lamp,
+            **{name: emitter for name, emitter in others.items() if name in lit},
+            "camera": camera,
+        },
+        optimize=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> prt.Scene:
+    return prt.Scene.from_mitsuba(room(), 0.12)
+
+
+@pytest.fixture(scope="module")
+def lamps(scene) -> prt.SceneEmitters:
+    return prt.SceneEmitters(scene)
+
+
+@pytest.fixture(scope="module")
+def transport(scene, lamps) -> prt.LightTransport:
+    return prt.precompute(scene, lamps, max_depth=DEPTH, progress=False)
+
+
+def rendered_at_vertices(scene: prt.Scene, spp: int = 256) -> tuple[NDArray, NDArray]:
+    """Radiance (n_v, 3) of all vertices by Mitsuba's ``path``, twice; emitters on surfaces do not count themselves."""
+    sensor = mi.load_dict({"type": "mesh_vertices", "vertices": scene.n_vertices})
+    sensor.bind(scene.mitsuba)
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    halves = [
+        sensor.radiance(mi.render(scene.mitsuba, sensor=sensor, integrator=path, spp=spp, seed=seed))
+        for seed in (1, 2)
+    ]
+    for mesh, shape in zip(scene.meshes, scene.mitsuba.shapes(), strict=True):
+        if shape.is_emitter():
+            for half in halves:
+                half[mesh.vertices] -= [8, 7, 5]
+    return halves[0], halves[1]
+
+
+def test_all_lamps_together_are_what_mitsuba_renders(scene, transport):
+    """Rationale: the sum of the columns is the scene as authored.
+
+    Expected: on every mesh no bias (the mean within 1%), and an error of a few per cent (finite elements, their
+    noise, and Mitsuba's hits beside the vertices).
+    """
+    x, y = rendered_at_vertices(scene)
+    ours = transport.relight(1.0)
+    for mesh in scene.meshes:
+        own = mesh.vertices
+        assert ours[own].mean() == pytest.approx((x[own].mean() + y[own].mean()) / 2, rel=0.01), mesh.name
+        assert relative_l2_without_noise(ours[own], x[own], y[own]) < 0.05, mesh.name
+
+
+@pytest.mark.parametrize("name", ["panel", "beam"])
+def test_a_column_is_the_scene_with_one_lamp(scene, transport, name):
+    """Rationale: ``columns`` are the one-light-at-a-time images that people ask Mitsuba for."""
+    lit = "lamp" if name == "panel" else name
+    alone = prt.Scene.from_mitsuba(room((lit,)), 0.12)
+    x, y = rendered_at_vertices(alone)
+    column = transport.columns([transport.emission.names.index(name)])[:, 0]
+    assert np.allclose(column, transport.relight({name: 1.0}), atol=1e-6 * column.max())
+    assert column.mean() == pytest.approx((x.mean() + y.mean()) / 2, rel=0.01)
+    assert relative_l2_without_noise(column, x, y) < 0.05
+
+
+def test_lamps_are_dimmed_coloured_and_grouped(scene, transport):
+    red = transport.relight({"panel": [2, 0, 0], "sky": 0.5})
+    panel, sky = (transport.emission.names.index(name) for name in ("panel", "sky"))
+    columns = transport.columns([panel, sky])
+    assert np.allclose(red, columns[:, 0] * [2, 0, 0] + 0.5 * columns[:, 1], atol=1e-6 * columns.max())
+    groups = prt.SceneEmitters(scene, {"small": ["bulb", "beam"], "wide": ["panel", "sky"]})
+    pairs = prt.precompute(scene, groups, max_depth=2, progress=False)
+    single = prt.precompute(scene, transport.emission, max_depth=2, progress=False)
+    wanted = single.relight({"panel": 1.0, "sky": 1.0})
+    # half of the rays for each of two lamps: noise, of which the mean has little
+    assert pairs.relight({"wide": 1.0}).mean() == pytest.approx(wanted.mean(), rel=0.01)
+    assert pairs.relight({"small": 1.0}).mean() == pytest.approx(
+        single.relight({"bulb": 1.0, "beam": 1.0}).mean(), rel=0.01
+    )
+
+
+def test_paths_and_finite_elements_agree(scene, lamps, transport):
+    paths = prt.precompute(scene, lamps, "brute_force", max_depth=DEPTH, spp=16, progress=False)
+    ours, theirs = transport.columns(range(4)), paths.columns(range(4))
+    for column in range(4):
+        assert ours[:, column].mean() == pytest.approx(theirs[:, column].mean(), rel=0.01)
+    # the estimates of both are of the whole matrix, independently
+    difference = np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)
+    errors = [t.report["estimated_error"]["total"] for t in (transport, paths)]
+    assert difference < 1.2 * np.hypot(*errors) + 0.01
+
+
+def test_a_picture_at_its_pixels(scene, lamps, artefact):
+    """Rationale: lamps x pixels, both other than the papers'. Results: the image beside Mitsuba's, as an artefact."""
+    import matplotlib.pyplot as plt
+
+    pixels = prt.camera_pixels(scene, spp=16)
+    transport = prt.precompute(scene, lamps, measurement=pixels, max_depth=DEPTH, progress=False)
+    image = prt.render(scene, transport, 1.0, spp=16)
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    x, y = (
+        np.array(mi.render(scene.mitsuba, integrator=path, spp=256, seed=seed))[..., :3] for seed in (1, 2)
+    )
+    figure, axes = plt.subplots(1, 2)
+    for axis, shown in zip(axes, (image, (x + y) / 2), strict=True):
+        axis.imshow(np.clip(shown, 0, 1) ** (1 / 2.2))
+    artefact(figure)
+    dim = x.max(axis=2) < 2  # without the lamp itself, whose edge is noise in both
+    assert image[dim].mean() == pytest.approx(x[dim].mean(), rel=0.01)
+    assert relative_l2_without_noise(image[dim], x[dim], y[dim]) < 0.06
+
+
+def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
+    transport.save(tmp_path / "a.prt")
+    loaded = prt.load_transport(tmp_path / "a.prt")
+    assert loaded.emission.names == transport.emission.names
+    assert np.array_equal(loaded.relight({"beam": 2.0}), transport.relight({"beam": 2.0}))
+    with_scene = prt.load_transport(tmp_path / "a.prt", scene)
+    assert np.array_equal(prt.render(scene, with_scene, 1.0, spp=4), prt.render(scene, transport, 1.0, spp=4))
+
+
+@pytest.mark.parametrize(
+    ("light", "words"),
+    [
+        ({"lamp": 1.0}, "there is no lamp 'lamp'; there are: panel"),
+        ([1.0, 2.0], "light has shape"),
+        ({"beam": np.nan}, "NaN"),
+    ],
+)
+def test_bad_light_is_one_line(transport, light, words):
+    with pytest.raises(prt.PrtError, match=words) as error:
+        transport.relight(light)
+    assert "\n" not in str(error.value)
+
+
+def test_bad_arguments_are_one_line(scene, lamps, transport):
+    with pytest.raises(prt.PrtError, match="names the emitter 'sun'; the scene has: "):
+        prt.SceneEmitters(scene, {"day": ["sun"]})
+    with pytest.raises(prt.PrtError, match="names no emitter"):
+        prt.SceneEmitters(scene, {"night": []})
+    dark = prt.Scene.from_mitsuba(room(()), 0.5)
+    with pytest.raises(prt.PrtError, match="has no emitters"):
+        prt.SceneEmitters(dark)
+    with pytest.raises(prt.PrtError, match="'sparse' knows no lamps"):
+        prt.precompute(scene, lamps, "sparse", progress=False)
+    with pytest.raises(prt.PrtError, match="for light from a cubemap"):
+        prt.precompute(scene, lamps, terms=4, progress=False)
+    with pytest.raises(prt.PrtError, match="small as it is"):
+        prt.compress(transport, progress=False)
+
+
+def test_points_of_a_measurement_are_in_the_world(scene, transport):
+    """Sensor hits lie beside the vertices, which are where the rows hold."""
+    points = transport.measurement.points
+    assert np.allclose(points.positions, scene.positions, atol=2e-3 / scene.scale)
+    assert np.allclose(points.normals, scene.normals)
+    hits = sensor_points(scene)
+    world = hits.positions / scene.scale + scene.centre
+    assert np.abs(world - points.positions).max() < 5e-3 / scene.scale
+    assert (np.einsum("nd,nd->n", points.ray_offsets, points.normals) > 0).all()
