@@ -11,6 +11,7 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.compression.clustered_pca import MeshClusters, clustered_mesh, mesh_rows
 from mi_sparse_prt.compression.haar_truncation import TARGET, haar_part
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.metrics import relative_l2_by_name
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.transport import LightTransport
@@ -154,12 +155,7 @@ def _clustered(
 
 def _errors(transport: LightTransport, sums: list[tuple[float, float]]) -> dict[str, float]:
     """Relative L2 of each mesh and ``total``, from squared errors and squared norms."""
-    errors = {mesh.name: _root(*pair) for mesh, pair in zip(transport.meshes, sums, strict=True)}
-    return errors | {"total": _root(*np.sum(sums, axis=0))}
-
-
-def _root(squares: float, norms: float) -> float:
-    return float(np.sqrt(squares / norms)) if norms > 0 else 0.0
+    return relative_l2_by_name({mesh.name: pair for mesh, pair in zip(transport.meshes, sums, strict=True)})
 
 
 def _with_fewer_bases(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.compression.clustered_pca import mesh_rows
+from mi_sparse_prt.core.metrics import relative_l2_by_name
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar
@@ -97,6 +98,7 @@ def haar_part(
     elements = part.scales.size * transport.lighting.n_directions
     names = [mesh.name for mesh in transport.meshes]
     lengths = [np.diff(mesh.part.starts) for mesh in found]
+    by_name = dict(zip(names, found, strict=True))
     report = {
         "target_error": target_error,
         "coefficients": {
@@ -105,10 +107,10 @@ def haar_part(
         },
         "kept_energy": {
             name: 1 - mesh.left_out / mesh.energy if mesh.energy > 0 else 1.0
-            for name, mesh in zip(names, found, strict=True)
+            for name, mesh in by_name.items()
         },
-        "error": _relative(names, [(mesh.squares, mesh.norms) for mesh in found])
-        | {"on_sphere": _relative(names, [(mesh.on_sphere, mesh.energy) for mesh in found])},
+        "error": relative_l2_by_name({name: (mesh.squares, mesh.norms) for name, mesh in by_name.items()})
+        | {"on_sphere": relative_l2_by_name({name: (m.on_sphere, m.energy) for name, m in by_name.items()})},
         "nbytes": part.nbytes,
         "ratio": 4 * elements / part.nbytes,
     }
@@ -232,9 +234,3 @@ def _joined(parts: list[HaarRows]) -> HaarRows:
         np.concatenate([part.scales for part in parts]),
         parts[0].lighting,
     )
-
-
-def _relative(names: list[str], sums: list[tuple[float, float]]) -> dict[str, float]:
-    """Relative L2 of each mesh and ``total``, from squared errors and squared norms."""
-    pairs = zip([*names, "total"], [*sums, np.sum(sums, axis=0)], strict=True)
-    return {name: float(np.sqrt(squares / norms)) if norms > 0 else 0.0 for name, (squares, norms) in pairs}

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.metrics import relative_noise
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.measurement.point_arrays import PointArrays
@@ -138,9 +139,7 @@ class GatherRays:
         place = row[self.point[own]] + half * len(some), self.seen[own]
         halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
         light = random_combinations(direct.visibility, MIXED, np.random.default_rng(seed))
-        first, second = np.split(halves @ light, 2)
-        norm = float(np.linalg.norm(first + second))
-        return float(np.linalg.norm(first - second)) / norm if norm > 0 else 0.0
+        return relative_noise(*np.split(halves @ light, 2))
 
 
 def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: int) -> GatherRays:

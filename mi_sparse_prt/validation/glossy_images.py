@@ -9,34 +9,31 @@ From Mitsuba's image of the real BSDFs to ours there are three steps, each betwe
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import flip_evaluator
 import mitsuba as mi
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.metrics import flip_map, relative_l2_without_noise, relative_noise
 from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
-from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation import matrix_figures as draw
+from mi_sparse_prt.validation.mitsuba_reference import lit_scene, posed
+from mi_sparse_prt.validation.validate import Validation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TURNS = (0, 60, -60)  # degrees, of the scene's own camera
 MOST_BOUNCES = 64  # where there is no limit: no Russian roulette, which ends paths of negative weight
@@ -59,8 +56,7 @@ CAUSES = {
 }
 
 
-@dataclass(frozen=True)
-class GlossyValidation:
+class GlossyValidation(Validation):
     """Outcome of ``validate_glossy``.
 
     Attributes
@@ -75,17 +71,6 @@ class GlossyValidation:
     figures : dict of matplotlib Figure
         One for each image, ``<environment>_<camera>``.
     """
-
-    report: dict[str, Any]
-    figures: dict[str, Figure]
-
-    def save(self, folder: str | Path) -> None:
-        """Write ``report.json`` and a PNG of every figure into a folder (made if needed)."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.json").write_text(json.dumps(self.report, indent=1))
-        for name, figure in self.figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
 
 
 def validate_glossy(
@@ -152,7 +137,7 @@ def validate_glossy(
             radiance = transport.lighting.project(environment)
             references = _References(scene, transport, radiance)
             for j, (sensor, turn) in enumerate(views):
-                with _posed(sensor, width, turn, scene.centre):
+                with posed(sensor, width, turn, scene.centre):
                     regions = references.regions(sensor, spp, _seed(seed, i, j, 99))
                     rendered = references.rendered(sensor, spp, (seed, i, j))
                 camera = {"number": j} if sensors else {"number": j, "turned": turn}
@@ -180,25 +165,6 @@ def _views(scene: Scene, sensors: Sequence[mi.Sensor] | None) -> list[tuple[mi.S
 def _seed(*numbers: int) -> int:
     """One for each image, all unlike."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
-
-
-@contextmanager
-def _posed(sensor: mi.Sensor, width: int, turn: int, centre: NDArray[np.float64]) -> Iterator[None]:
-    """Within this context a sensor has a film of another size, and is turned about an axis through a point."""
-    parameters = mi.traverse(sensor)
-    size = next(k for k in parameters.keys() if k.endswith("film.size"))
-    old = {size: mi.ScalarVector2u(parameters[size]), "to_world": mi.Transform4f(parameters["to_world"])}
-    c = mi.ScalarVector3f(centre)
-    about = mi.Transform4f().translate(c).rotate([0, 1, 0], turn).translate(-c)
-    height = max(1, round(width * old[size].y / old[size].x))
-    new = {size: mi.ScalarVector2u(width, height)}
-    if turn:
-        new["to_world"] = about @ old["to_world"]
-    try:
-        parameters.update(new)
-        yield
-    finally:
-        parameters.update({key: old[key] for key in new})
 
 
 class DirectionLights(CubemapEmitter):
@@ -253,12 +219,12 @@ class _References:
         lights = mi.Properties("cubemap")
         lights["data"], lights["resolution"] = mi.TensorXf(radiance.reshape(6, n, n, 3)), n
         factored = _factored_shapes(scene, transport, shapes)
-        white = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}})
+        unit_albedo = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}})
         self._lit = {
             "real": lit_scene(shapes, sky),
             "factored": lit_scene(factored, sky),
             "directions": lit_scene(factored, DirectionLights(lights)),
-            "diffuse": lit_scene([with_bsdf(shape, white) for shape in shapes], sky),
+            "diffuse": lit_scene([with_bsdf(shape, unit_albedo) for shape in shapes], sky),
         }
         depth = transport.report["parameters"]["max_depth"]
         self._depth = MOST_BOUNCES if depth < 0 else depth
@@ -329,6 +295,8 @@ def thin_shadows(lit: Image, shape: NDArray[np.integer], normal: Image) -> Mask:
         What pixels see, -1 for nothing.
     normal : (height, width, 3) float
     """
+    from scipy import ndimage
+
     alike = ndimage.minimum_filter(shape, WINDOW) == ndimage.maximum_filter(shape, WINDOW)
     mean = ndimage.uniform_filter(normal, (WINDOW, WINDOW, 0))
     smooth: Mask = alike & (shape >= 0) & (np.linalg.norm(mean, axis=2) > SMOOTH)
@@ -337,12 +305,6 @@ def thin_shadows(lit: Image, shape: NDArray[np.integer], normal: Image) -> Mask:
     change = ndimage.gaussian_gradient_magnitude(lit, BLUR, truncate=2)
     found: Mask = smooth & (change > 0) & (change >= np.quantile(change[smooth], 1 - SHADOWS))
     return found
-
-
-def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter) -> mi.Scene:
-    """Shapes under one light, which rays do not slip between."""
-    named = {f"shape_{k}": shape for k, shape in enumerate(shapes)}
-    return mi.load_dict({**watertight_scene(), "light": light, **named})
 
 
 def _surfaces(transport: LightTransport) -> InOutFactors:
@@ -386,13 +348,13 @@ def with_bsdf(mesh: mi.Mesh, bsdf: mi.BSDF) -> mi.Mesh:
 def _compared(rendered: dict[str, Halves], regions: dict[str, Mask]) -> tuple[dict[str, Any], Figure]:
     """Errors of each cause in each region, and the picture of them."""
     means = {name: ((a + b) / 2).astype(np.float32) for name, (a, b) in rendered.items()}
-    flips = {cause: _flip(means[b], means[a]) for cause, (a, b) in CAUSES.items()}
+    flips = {cause: flip_map(means[b], means[a]) for cause, (a, b) in CAUSES.items()}
     first, second = rendered["real"]
     entry: dict[str, Any] = {
         "pixels": {name: float(mask.mean()) for name, mask in regions.items()},
         "noise": {
-            "relative_l2": float(np.linalg.norm(first - second) / np.linalg.norm(first + second)),
-            "flip_between_halves": float(_flip(first, second).mean()),
+            "relative_l2": relative_noise(first, second),
+            "flip_between_halves": float(flip_map(first, second).mean()),
         },
     }
     for name, mask in regions.items():
@@ -405,37 +367,9 @@ def _compared(rendered: dict[str, Halves], regions: dict[str, Mask]) -> tuple[di
 
 
 def _errors(ours: Halves, reference: Halves, flip: Image, mask: Mask) -> dict[str, float]:
-    error, uncertainty = relative_l2(ours, reference, mask)
+    (a, b), (x, y) = ([half[mask] for half in pair] for pair in (ours, reference))
+    error, uncertainty = relative_l2_without_noise(a, x, y, b)
     return {"relative_l2": error, "uncertainty": uncertainty, "flip": float(flip[mask].mean())}
-
-
-def relative_l2(ours: Halves, reference: Halves, mask: Mask) -> tuple[float, float]:
-    """Relative L2 difference of two images on some pixels (height, width), without the noise of either.
-
-    Returns
-    -------
-    error : float
-        A squared error below zero, which is noise about zero, is zero.
-    uncertainty : float
-        What noise alone may show as an error: its square is two standard errors of the squared error.
-    """
-    (a, b), (x, y) = (tuple(half[mask].astype(np.float64) for half in pair) for pair in (ours, reference))
-    first, second = a - x, b - y
-    square, norm = float((first * second).sum()), float((x * y).sum())
-    if not norm > 0:
-        return float(square > 0), 0.0
-    # first * second is |mean|^2 - |half the difference|^2. Of noise alone, both are alike and independent, and
-    # if it is Gaussian and the same in all channels, the variance of each is two thirds of its second moment.
-    noise = ((first - second) ** 2).sum(axis=1) / 4  # [pixel]
-    spread = 2 * float(np.sqrt(4 / 3 * (noise**2).sum()))
-    return float(np.sqrt(max(square, 0.0) / norm)), float(np.sqrt(spread / norm))
-
-
-def _flip(reference: Image, image: Image) -> Image:
-    """The FLIP map (height, width)."""
-    pair = (np.ascontiguousarray(np.maximum(i, 0), dtype=np.float32) for i in (reference, image))
-    found, _, _ = flip_evaluator.evaluate(*pair, "HDR", applyMagma=False)
-    return np.asarray(found)[..., 0]
 
 
 def _worst(images: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -451,9 +385,13 @@ def _worst(images: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 def _figure(means: dict[str, Image], regions: dict[str, Mask], entry: dict[str, Any]) -> Figure:
     """Ours, Mitsuba's, Mitsuba's with factors; below them the differences ([HR10] Figures 17 to 19)."""
+    from matplotlib.figure import Figure
+
+    from mi_sparse_prt.validation.matrix_figures import tonemapped
+
     shown = {"ours": "ours, relit", "real": "Mitsuba path", "factored": "Mitsuba path, factored BRDFs"}
     # one tone curve for all three, so that they can be compared
-    toned = np.split(draw.tonemapped(np.concatenate([means[name] for name in shown], axis=1)), 3, axis=1)
+    toned = np.split(tonemapped(np.concatenate([means[name] for name in shown], axis=1)), 3, axis=1)
     marked = 0.3 + 0.7 * toned[1].mean(axis=2, keepdims=True).repeat(3, axis=2)
     for region, colour in (("glossy", (1.0, 0.8, 0.4)), ("thin_shadows", (1.0, 0.0, 0.4))):
         marked[regions[region]] *= colour

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.transport import MeshRange
 
@@ -46,8 +49,7 @@ def errors(
     """Relative L2 difference of every row, noise of the reference included, and element against element."""
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    difference = np.linalg.norm(ours - reference, axis=(1, 2))
-    relative = difference / np.maximum(np.linalg.norm(reference, axis=(1, 2)), 1e-20)
+    relative = relative_l2(ours, reference, axis=(1, 2))
     for mesh in meshes:
         inside = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
         left.plot(vertices[inside], relative[inside], ".", label=mesh.name)
@@ -72,14 +74,18 @@ def images(
     report: dict[str, float],
 ) -> Figure:
     """Relit image, Mitsuba's image and their FLIP difference."""
-    figure = Figure(figsize=(15, 4.2), layout="constrained")
-    shown = [
-        (tonemapped(ours), "matrix, relit"),
-        (tonemapped(reference), "Mitsuba path"),
-        (np.asarray(flip), f"FLIP {report['flip']:.4f}, relative L2 {report['relative_l2']:.2%}"),
-    ]
-    for axes, (picture, title) in zip(figure.subplots(1, 3), shown, strict=True):
-        axes.imshow(np.clip(picture, 0, 1), vmin=0, vmax=1, cmap="magma")
+    error = f"FLIP {report['flip']:.4f}, relative L2 {report['relative_l2']:.2%}"
+    return picture_row(
+        {"matrix, relit": tonemapped(ours), "Mitsuba path": tonemapped(reference), error: flip}, "magma"
+    )
+
+
+def picture_row(pictures: Mapping[str, NDArray[np.floating]], cmap: str = "viridis") -> Figure:
+    """Pictures (height, width, 3), or numbers (height, width) as colours, in [0, 1], side by side with their titles."""
+    figure = Figure(figsize=(5 * len(pictures), 4.2), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(pictures)))
+    for axes, (title, picture) in zip(panels, pictures.items(), strict=True):
+        axes.imshow(np.clip(picture, 0, 1), vmin=0, vmax=1, cmap=cmap)
         axes.set_title(title)
         axes.axis("off")
     return figure

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +15,45 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
 from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
 from mi_sparse_prt.scene.scene import Scene
+
+
+def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter | dict[str, Any], **others: Any) -> mi.Scene:
+    """Shapes under one ``light``, which rays do not slip between, and other objects by name."""
+    named = {f"shape_{k}": shape for k, shape in enumerate(shapes)}
+    return mi.load_dict({**watertight_scene(), "light": light, **others, **named})
+
+
+@contextmanager
+def posed(
+    sensor: mi.Sensor, width: int, turn: float = 0.0, centre: NDArray[np.float64] | None = None
+) -> Iterator[None]:
+    """Within this context a sensor's film has another width and the same shape, and the sensor is turned.
+
+    Parameters
+    ----------
+    sensor : mi.Sensor
+    width : int
+        Pixels.
+    turn : float
+        Degrees about the world's Y axis through ``centre``.
+    centre : (3,) float, optional
+        The origin if not given.
+    """
+    parameters = mi.traverse(sensor)
+    size = next(k for k in parameters.keys() if k.endswith("film.size"))
+    old = {size: mi.ScalarVector2u(parameters[size])}
+    new = {size: mi.ScalarVector2u(width, max(1, round(width * old[size].y / old[size].x)))}
+    if turn:
+        c = mi.ScalarVector3f([0, 0, 0] if centre is None else centre)
+        old["to_world"] = mi.Transform4f(parameters["to_world"])
+        new["to_world"] = (
+            mi.Transform4f().translate(c).rotate([0, 1, 0], turn).translate(-c) @ old["to_world"]
+        )
+    try:
+        parameters.update(new)
+        yield
+    finally:
+        parameters.update(old)
 
 
 class ReferenceMatrix:
@@ -46,15 +87,11 @@ class ReferenceMatrix:
             light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
         else:
             light = {"type": "cubemap", "resolution": lighting.resolution, "texel": 0}
-        shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.normalised.shapes())}
-        self._scene = mi.load_dict(
-            {
-                **watertight_scene(),
-                "integrator": {"type": "path", "max_depth": max_depth},
-                "sensor": {"type": "mesh_vertices", "vertices": len(vertices)},
-                "light": light,
-                **shapes,
-            }
+        self._scene = lit_scene(
+            scene.normalised.shapes(),
+            light,
+            integrator={"type": "path", "max_depth": max_depth},
+            sensor={"type": "mesh_vertices", "vertices": len(vertices)},
         )
         self._sensor = self._scene.sensors()[0]
         self._sensor.bind(self._scene, rays.take(vertices))
@@ -91,8 +128,7 @@ def reference_image(
     scene: Scene, background: mi.Emitter, sensor: mi.Sensor, max_depth: int, spp: int, seed: int
 ) -> NDArray[np.float32]:
     """Mitsuba's ``path`` image (height, width, 3) of a scene's meshes under one environment emitter, world units."""
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.unlit_shapes())}
-    lit = mi.load_dict({**watertight_scene(), "light": background, **shapes})
+    lit = lit_scene(scene.unlit_shapes(), background)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
 
@@ -101,9 +137,8 @@ def reference_vertices(
     scene: Scene, background: mi.Emitter, rays: VertexRays, max_depth: int, spp: int, seed: int
 ) -> NDArray[np.float32]:
     """Mitsuba's ``path`` radiance (n_v, 3) of all vertices under one environment emitter."""
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.normalised.shapes())}
     sensor = {"type": "mesh_vertices", "vertices": len(rays.origins)}
-    lit = mi.load_dict({**watertight_scene(), "light": background, "sensor": sensor, **shapes})
+    lit = lit_scene(scene.normalised.shapes(), background, sensor=sensor)
     lit.sensors()[0].bind(lit, rays)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return lit.sensors()[0].radiance(mi.render(lit, integrator=integrator, spp=spp, seed=seed))

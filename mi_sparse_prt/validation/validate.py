@@ -5,21 +5,33 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import flip_evaluator
 import mitsuba as mi
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.metrics import (
+    flip_map,
+    relative_l2,
+    relative_l2_from_squares,
+    relative_l2_of_rows,
+    relative_l2_without_noise,
+)
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.transport import LightTransport, MeshRange
-from mi_sparse_prt.validation import matrix_figures as draw
-from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix, reference_image, reference_vertices
+from mi_sparse_prt.validation.mitsuba_reference import (
+    ReferenceMatrix,
+    posed,
+    reference_image,
+    reference_vertices,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 GRAZED = 1e-4  # relative difference from which an element of the direct part counts as different
 
@@ -45,11 +57,17 @@ class Validation:
 
     def save(self, folder: str | Path) -> None:
         """Write ``report.json`` and a PNG of every figure into a folder (made if needed)."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.json").write_text(json.dumps(self.report, indent=1))
-        for name, figure in self.figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+        save_figures(Path(folder), self.figures)
+        (Path(folder) / "report.json").write_text(json.dumps(self.report, indent=1))
+
+
+def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
+    """Write each figure as ``<name>.png`` into a folder (made if needed); where they are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+    return paths
 
 
 def validate(
@@ -96,6 +114,10 @@ def validate(
     apart: ``hit_against_vertex``, in relative L2 of the matrix. ``direct_at_hits`` is our direct part there against
     Mitsuba's (without noise, in the direction basis): the share of elements that differ by more than 1e-4.
     """
+    from mi_sparse_prt.validation import (
+        matrix_figures as draw,  # matplotlib: half a second for whoever imports us
+    )
+
     transport = transport.for_scene(scene)
     rng = np.random.default_rng([seed, 2])
     vertices = _stratified_vertices(transport.meshes, n_rows, rng)
@@ -160,18 +182,18 @@ def matrix_errors(
         inside[mesh.name] = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
         size = mesh.vertices.stop - mesh.vertices.start
         weight[inside[mesh.name]] = size / max(1, inside[mesh.name].sum())
-    rows = _ratio(square.sum(axis=1), _floored(norm.sum(axis=1)))
-    columns = _ratio(weight @ square, _floored(weight @ norm))
+    rows = relative_l2_of_rows(square.sum(axis=1), norm.sum(axis=1))
+    columns = relative_l2_of_rows(weight @ square, weight @ norm)
     worst_row, worst_column = int(np.argmax(rows)), int(np.argmax(columns))
 
     def total(values: NDArray[np.float64]) -> float:
-        return float(_ratio(weight @ values.sum(axis=1), weight @ norm.sum(axis=1)))
+        return float(relative_l2_from_squares(weight @ values.sum(axis=1), weight @ norm.sum(axis=1)))
 
     return {
         "relative_l2": {
             "total": total(square),
             "meshes": {
-                name: float(_ratio(square[own].sum(), norm[own].sum()))
+                name: float(relative_l2_from_squares(square[own].sum(), norm[own].sum()))
                 for name, own in inside.items()
                 if own.any()
             },
@@ -182,17 +204,6 @@ def matrix_errors(
         "row_worst": {"vertex": int(vertices[worst_row]), "relative_l2": float(rows[worst_row])},
         "column_worst": {"texel": int(texels[worst_column]), "relative_l2": float(columns[worst_column])},
     }
-
-
-def _ratio(square: NDArray[np.float64], norm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """sqrt(square / norm), 0 for a squared error below zero (noise about zero) and for 0 / 0."""
-    square = np.maximum(square, 0)
-    return np.sqrt(np.divide(square, norm, out=np.where(square > 0, 1.0, 0.0), where=norm > 0))
-
-
-def _floored(norm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Norms of at least a thousandth of their mean: rows and columns in the dark have no relative error."""
-    return np.maximum(norm, 1e-3 * norm.mean())
 
 
 def _stratified(count: int, wanted: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -232,17 +243,16 @@ def _moved_to_hits(
         solver = DirectSolver(
             scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"]
         )
-        white = solver.elements(*flat).reshape(len(vertices), -1, 1)
-        return transport.albedo[vertices][:, None] * white
+        unit_albedo = solver.elements(*flat).reshape(len(vertices), -1, 1)
+        return transport.albedo[vertices][:, None] * unit_albedo
 
     step = direct(hits, transport.basis) - direct(vertex_points(scene), transport.basis)
     reference = ReferenceMatrix(scene, lighting, "direction", 2, vertices, rays).columns(texels, spp=1)
     difference = np.abs(direct(hits, "direction") - reference)
     different = (difference > GRAZED * np.abs(reference)).any(axis=2)
-    scale = max(float(np.linalg.norm(ours)), 1e-30)
     return ours + step, {
         "direct_at_hits": float(different.mean()),
-        "hit_against_vertex": float(np.linalg.norm(step)) / scale,
+        "hit_against_vertex": float(relative_l2(ours + step, ours)),
     }
 
 
@@ -256,12 +266,14 @@ def _image_error(
     seed: int,
 ) -> tuple[dict[str, float], Figure]:
     """A relit image against ``path`` under the same cubemap, in two halves, and what interpolation alone costs."""
+    from mi_sparse_prt.validation import matrix_figures as draw
+
     lighting = transport.lighting.project(environment)
     background = background_emitter(lighting, transport.lighting)
     max_depth = transport.report["parameters"]["max_depth"]
     sensor = scene.mitsuba.sensors()[0]
     seeds = (2 * seed + 10, 2 * seed + 11)
-    with _Resized(sensor, width):
+    with posed(sensor, width):
         ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
         halves = [reference_image(scene, background, sensor, max_depth, spp // 2, seed=k) for k in seeds]
         exact = []  # images of Mitsuba's own vertices, interpolated as ours are
@@ -277,34 +289,12 @@ def _image_error(
             )
             exact.append(np.array(image)[..., :3])
     reference = (halves[0] + halves[1]) / 2
-    norm = (halves[0] * halves[1]).sum(dtype=np.float64)
-    square = ((ours - halves[0]) * (ours - halves[1])).sum(dtype=np.float64)
-    interpolation = ((exact[0] - halves[0]) * (exact[1] - halves[1])).sum(dtype=np.float64)
-    flip_map, flip_mean, _ = flip_evaluator.evaluate(reference, ours, "HDR")
+    x, y = (half.astype(np.float64) for half in halves)
+    flip = flip_map(reference, ours)
     report = {
-        "relative_l2": float(_ratio(square, norm)),
-        "interpolation": float(_ratio(interpolation, norm)),
-        "reference_noise": float(np.linalg.norm(halves[0] - halves[1]) / 2 / np.sqrt(norm)),
-        "flip": float(flip_mean),
+        "relative_l2": relative_l2_without_noise(ours, x, y)[0],
+        "interpolation": relative_l2_without_noise(exact[0], x, y, exact[1])[0],
+        "reference_noise": float(relative_l2_from_squares(((x - y) ** 2).sum() / 4, (x * y).sum())),
+        "flip": float(flip.mean()),
     }
-    return report, draw.images(ours, reference, flip_map, report)
-
-
-class _Resized:
-    """Within this context a sensor's film has another width and the same shape."""
-
-    def __init__(self, sensor: mi.Sensor, width: int) -> None:
-        self._parameters = mi.traverse(sensor)
-        self._key = next(k for k in self._parameters.keys() if k.endswith("film.size"))
-        self._old = mi.ScalarVector2u(self._parameters[self._key])
-        self._new = mi.ScalarVector2u(width, max(1, round(width * self._old.y / self._old.x)))
-
-    def _set(self, size: mi.ScalarVector2u) -> None:
-        self._parameters[self._key] = size
-        self._parameters.update()
-
-    def __enter__(self) -> None:
-        self._set(self._new)
-
-    def __exit__(self, *_: object) -> None:
-        self._set(self._old)
+    return report, draw.images(ours, reference, flip, report)

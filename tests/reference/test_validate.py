@@ -232,8 +232,8 @@ LAMP = """
 import mitsuba as mi
 import numpy as np
 import mi_sparse_prt as prt
-from mi_sparse_prt.scene import Scene
-from mi_sparse_prt.validation.reference import reference_image
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.validation.mitsuba_reference import reference_image
 
 T = mi.ScalarTransform4f
 lamp = {"type": "rectangle", "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], 90).scale(0.2),

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from conftest import T, build, diffuse
 from matplotlib.figure import Figure
+from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, FactorOptions, factor_cache

@@ -4,10 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import build, diffuse
-
-import mi_sparse_prt as prt
 from mi_sparse_prt.glossy import GlossyTransport
 from mi_sparse_prt.operators.direct_columns import DirectColumns
+
+import mi_sparse_prt as prt
 from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene

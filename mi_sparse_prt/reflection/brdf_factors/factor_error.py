@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_sparse_prt.core.metrics import relative_l2_from_squares
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import Doubles, Floats
 from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors
@@ -68,13 +69,9 @@ def measure_factor_error(
     for k in range(factors.terms):
         found += f[k, :, None] * g[k].T
         squares = weights * ((found - true) ** 2).sum(axis=1)
-        errors.append([_relative(squares[some], norms[some]) for some in (slice(None), grazing, peak)])
+        sums = [(squares[some].sum(), norms[some].sum()) for some in (slice(None), grazing, peak)]
+        errors.append([float(relative_l2_from_squares(*pair)) for pair in sums])
     return FactorError(*np.transpose(errors))
-
-
-def _relative(squares: Doubles, norms: Doubles) -> float:
-    """Of sums; nothing is no error of nothing."""
-    return float(np.sqrt(squares.sum() / max(norms.sum(), 1e-30)))
 
 
 def sample_pairs(bsdf: mi.BSDF, pairs: int, seed: int) -> tuple[Floats, Floats, Doubles]:
