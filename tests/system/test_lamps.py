@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import relative_l2_without_noise
@@ -169,9 +170,10 @@ def test_a_picture_at_its_pixels(scene, lamps, artefact):
     for axis, shown in zip(axes, (image, (x + y) / 2), strict=True):
         axis.imshow(np.clip(shown, 0, 1) ** (1 / 2.2))
     artefact(figure)
-    dim = x.max(axis=2) < 2  # without the lamp itself, whose edge is noise in both
+    # without the edge of the lamp itself: few samples of something bright, in both
+    dim = ~binary_dilation(x.max(axis=2) > 2, iterations=3)
     assert image[dim].mean() == pytest.approx(x[dim].mean(), rel=0.01)
-    assert relative_l2_without_noise(image[dim], x[dim], y[dim])[0] < 0.06
+    assert relative_l2_without_noise(image[dim], x[dim], y[dim])[0] < 0.04
 
 
 def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
@@ -180,7 +182,8 @@ def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
     assert loaded.emission.names == transport.emission.names
     assert np.array_equal(loaded.relight({"beam": 2.0}), transport.relight({"beam": 2.0}))
     with_scene = prt.load_transport(tmp_path / "a.prt", scene)
-    assert np.array_equal(prt.render(scene, with_scene, 1.0, spp=4), prt.render(scene, transport, 1.0, spp=4))
+    images = [prt.render(scene, t, 1.0, spp=4) for t in (with_scene, transport)]
+    assert np.allclose(*images, atol=1e-5)  # threads add samples to pixels in any order
 
 
 @pytest.mark.parametrize(
