@@ -134,9 +134,9 @@ def test_finite_elements_and_paths_agree(lighting, light):
     """
     scene = ball_on_ground(chequered=False)
     pixels = prt.camera_pixels(scene, spp=16)
-    asked = {"basis": "texel", "max_depth": DEPTH, "measurement": pixels, "progress": False}
+    asked = {"max_depth": DEPTH, "measurement": pixels, "progress": False}
     ours = prt.precompute(scene, lighting, "auto", **asked).operators["indirect"].relight(light)
-    paths = prt.precompute(scene, lighting, "brute_force", spp=4, indirect_resolution=2, **asked)
+    paths = prt.precompute(scene, lighting, "brute_force", spp=2, **asked)
     assert ours.mean() == pytest.approx(paths.operators["indirect"].relight(light).mean(), rel=0.02)
 
 
