@@ -8,10 +8,10 @@ import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.core.sobol import sobol_points
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
@@ -148,8 +148,7 @@ def cosine_rays(
 
 def sobol(n: int) -> list[mi.UInt32]:
     """Three columns of n Sobol points as 32-bit fractions, neighbours on the square side by side."""
-    fractions = qmc.Sobol(3, scramble=False, bits=32).random(n)
-    points = (fractions * 2.0**32).astype(np.uint64).astype(np.uint32)
+    points = sobol_points(n)
     order = np.argsort(_interleaved(points[:, 0] >> 16, points[:, 1] >> 16), kind="stable")
     columns = [mi.UInt32(column) for column in points[order].T.copy()]
     dr.eval(columns)
