@@ -155,7 +155,8 @@ def _checked(
 ) -> tuple[NDArray, Floats, Floats, float]:
     """The products as arrays that compiled code takes, and the rounding of the Gram matrix."""
     G = np.asarray(gram)
-    G = np.ascontiguousarray(G, dtype=np.float32 if G.dtype == np.float32 else np.float64)
+    eps = float(np.finfo(np.float32 if G.dtype == np.float32 else np.float64).eps)
+    G = np.ascontiguousarray(G, dtype=np.float64)  # one type: the solver is compiled once
     r = np.array(correlation, dtype=np.float64, order="C", ndmin=1)
     s = np.array(squared_norm, dtype=np.float64, order="C", ndmin=1)
     if r.ndim != 2 or G.shape != (*r.shape, r.shape[1]) or s.shape != r.shape[:1]:
@@ -167,7 +168,7 @@ def _checked(
         raise PrtError(
             f"problem {np.argmin(fine)} of {len(fine)} is not finite, or has a squared_norm < 0; check its samples"
         )
-    return G, r, s, float(np.finfo(G.dtype).eps)
+    return G, r, s, eps
 
 
 # -- the problem in units of its own ----------------------------------------------------------------------------------
@@ -278,9 +279,11 @@ def _descend(
             active, factored, arrived = _move(b, target, order, active, penalised or non_negative)
         _keep_bounded(b, half)
 
-        q[:] = c
+        for i in range(len(q)):
+            q[i] = c[i]
         for a in range(active):
-            q -= b[order[a]] * g[order[a]]
+            for i in range(len(q)):
+                q[i] -= b[order[a]] * g[order[a], i]
     objective, gap = _objective_and_gap(b, c, q, half, non_negative)
     return objective, gap, MAX_STEPS
 
