@@ -5,6 +5,7 @@ Plain arrays. An item (a vertex) has one row or several (colour channels, terms 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -169,49 +170,29 @@ def fitted(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centre
     """
     clusters = _without_empty(rows, weights, clusters, centred)
     counts = np.bincount(clusters.labels, minlength=len(clusters))
-    order = np.argsort(clusters.labels, kind="stable")
-    ends = np.cumsum(counts)
-    sizes = np.argsort(-counts, kind="stable")
-    turns = np.concatenate([sizes[::2], sizes[1::2]])  # threads take halves
+    items = np.split(np.argsort(clusters.labels, kind="stable"), np.cumsum(counts)[:-1])
+    k, g, m = len(clusters), rows.shape[1], rows.shape[2]
     start = np.ascontiguousarray(clusters.bases[:, :bases])
-    random = random_mixtures(counts.max() * rows.shape[1], bases - start.shape[1])
-    with one_blas_thread():
-        means, vectors = _fitted(rows, weights, order, ends, turns, start, bases, centred, random)
+    random = random_mixtures(counts.max() * g, bases - start.shape[1])
+
+    means, vectors = np.zeros((k, m), np.float32), np.zeros((k, bases, m), np.float32)
+
+    def fit(turns: Indices) -> None:
+        for c in turns:
+            own, shares = rows[items[c]].reshape(-1, m), np.repeat(weights[items[c]], g)
+            means[c], found = affine_space(own, shares, bases, start[c], centred, random)
+            vectors[c, : len(found)] = found
+
+    # threads of Python: in a parallel loop of numba, all of `affine_space` would be compiled three times over
+    threads, sizes = numba.get_num_threads(), np.argsort(-counts, kind="stable")
+    with one_blas_thread(), ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fit, [sizes[t::threads] for t in range(threads)]))  # large and small ones for each
     return Clusters(clusters.labels, means, vectors)
 
 
 def random_mixtures(rows: int, missing: int) -> Floats:
     """Coefficients (rows, any) of the combinations of rows that a search for components begins with."""
     return np.random.default_rng(0).standard_normal((rows, max(missing, 0) + MORE), np.float32)
-
-
-@numba.njit(parallel=True, cache=True)
-def _fitted(
-    rows: Floats,
-    weights: Floats,
-    order: Indices,
-    ends: Indices,
-    turns: Indices,
-    start: Floats,
-    bases: int,
-    centred: bool,
-    random: Floats,
-) -> tuple[Floats, Floats]:
-    """``affine_space`` of all clusters; the items of cluster c are ``order[ends[c - 1] : ends[c]]``."""
-    k, g, m = len(ends), rows.shape[1], rows.shape[2]
-    means, vectors = np.zeros((k, m), np.float32), np.zeros((k, bases, m), np.float32)
-    for turn in numba.prange(k):
-        c = turns[turn]
-        first = ends[c - 1] if c > 0 else 0
-        own, shares = (
-            np.empty(((ends[c] - first) * g, m), np.float32),
-            np.empty((ends[c] - first) * g, np.float32),
-        )
-        for i in range(len(own)):
-            own[i], shares[i] = rows[order[first + i // g], i % g], weights[order[first + i // g]]
-        mean, found = affine_space(own, shares, bases, start[c], centred, random)
-        means[c], vectors[c, : len(found)] = mean, found
-    return means, vectors
 
 
 @numba.njit(nogil=True, cache=True)

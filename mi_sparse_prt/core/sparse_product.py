@@ -80,4 +80,6 @@ def _multiply(
                     for k in range(width):
                         total[h, k] += p * light[a, k]
                 e += 1
-            result[:, i] = total
+            for h in range(len(albedo)):  # not a slice: its error message alone compiles for seconds
+                for k in range(width):
+                    result[h, i, k] = total[h, k]

@@ -203,10 +203,9 @@ def _packed(
     total, a = counts.sum(), 0
     flat, weight = np.empty(total, np.int64), np.empty(total)
     for i in range(len(counts)):
-        b = a + counts[i]
-        flat[a:b] = texels[i, : counts[i]]
-        weight[a:b] = weights[i, : counts[i]]
-        a = b
+        for k in range(counts[i]):  # not slices: their error message alone compiles for seconds
+            flat[a + k], weight[a + k] = texels[i, k], weights[i, k]
+        a += counts[i]
     return flat, weight
 
 

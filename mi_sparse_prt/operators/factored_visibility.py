@@ -346,7 +346,9 @@ def _relit(
             for c in range(3):
                 for k in range(tables.shape[3]):
                     total[c, k] += value[0, k] * power[j, c]
-        result[i] = total.T[:terms]
+        for k in range(terms):  # not a slice: its error message alone compiles for seconds
+            for c in range(len(total)):
+                result[i, k, c] = total[c, k]
     return result
 
 
@@ -391,5 +393,7 @@ def _combined(
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
             _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b] * more)
-        result[i] = total.T[:terms]
+        for k in range(terms):  # not a slice: its error message alone compiles for seconds
+            for c in range(len(total)):
+                result[i, k, c] = total[c, k]
     return result

@@ -35,8 +35,8 @@ def linear_weights(
         0 where there is no neighbour.
     """
     return _linear_weights(
-        neighbours.ids,
-        neighbours.distances,
+        np.ascontiguousarray(neighbours.ids),  # one layout: compiled once
+        np.ascontiguousarray(neighbours.distances),
         np.hstack([positions, normals]),
         np.hstack([dense_positions, dense_normals]),
     )

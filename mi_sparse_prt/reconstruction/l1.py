@@ -109,7 +109,8 @@ def check_products(
         For shapes that do not match, or values that are not finite (naming the problem).
     """
     G = np.asarray(gram)
-    G = np.ascontiguousarray(G, dtype=np.float32 if G.dtype == np.float32 else np.float64)
+    eps = float(np.finfo(np.float32 if G.dtype == np.float32 else np.float64).eps)
+    G = np.ascontiguousarray(G, dtype=np.float64)  # one type: the solver is compiled once
     r = np.array(correlation, dtype=np.float64, order="C", ndmin=1)
     s = np.array(squared_norm, dtype=np.float64, order="C", ndmin=1)
     if r.ndim != 2 or G.shape != (*r.shape, r.shape[1]) or s.shape != r.shape[:1]:
@@ -121,7 +122,7 @@ def check_products(
         raise PrtError(
             f"problem {np.argmin(fine)} of {len(fine)} is not finite, or has a squared_norm < 0; check its samples"
         )
-    return G, r, s, float(np.finfo(G.dtype).eps)
+    return G, r, s, eps
 
 
 # -- the problem in units of its own ----------------------------------------------------------------------------------
@@ -231,9 +232,11 @@ def _descend(
             active, factored, arrived = _move(b, target, order, active, penalised)
         _keep_bounded(b, half)
 
-        q[:] = c
+        for i in range(len(q)):
+            q[i] = c[i]
         for a in range(active):
-            q -= b[order[a]] * g[order[a]]
+            for i in range(len(q)):
+                q[i] -= b[order[a]] * g[order[a], i]
     objective, gap = objective_and_gap(b, c, q, half)
     return objective, gap, most_steps
 

@@ -39,8 +39,8 @@ def normal_equations(
     squared_norm = np.zeros(n)
     for i in numba.prange(n):
         system, y = _gather(rows, neighbours[i], directions[i], values[i])
-        gram[i] = system.T @ system
-        correlation[i] = system.T @ y
+        np.dot(system.T, system, gram[i])  # not into a slice: its error message alone compiles for seconds
+        np.dot(system.T, y, correlation[i])
         squared_norm[i] = y @ y
     return gram, correlation, squared_norm
 

@@ -121,17 +121,21 @@ def choose_features(
     for i in numba.prange(len(neighbours)):
         near = neighbours[i][neighbours[i] >= 0]
         weight = _weights(rows, features, near)
-        least = np.partition(weight, len(weight) - count)[len(weight) - count] if count < len(weight) else 0.0
+        least = _largest(weight, count) if count < len(weight) else 0.0
+        ties = count - (weight > least).sum()  # how many of the least are taken
         place = 0
-        for ties in (False, True):
-            for j in range(len(weight)):
-                if weight[j] <= 0 or place == count:
-                    continue
-                if (weight[j] == least) if ties else (weight[j] > least):
-                    chosen[i, place] = j
-                    place += 1
-        chosen[i, :place].sort()
+        for j in range(len(weight)):
+            if weight[j] > least or (weight[j] == least and ties > 0 and least > 0):
+                ties -= weight[j] == least
+                chosen[i, place] = j
+                place += 1
     return chosen
+
+
+@numba.njit(cache=True)
+def _largest(weight: NDArray[np.float64], count: int) -> float:
+    """The ``count``-th largest; apart from the parallel loop, into which it would be compiled twice."""
+    return np.partition(weight, len(weight) - count)[len(weight) - count]
 
 
 @numba.njit(cache=True)

@@ -149,7 +149,7 @@ def cosine_rays(
 def sobol(n: int) -> list[mi.UInt32]:
     """Three columns of n Sobol points as 32-bit fractions, neighbours on the square side by side."""
     points = sobol_points(n)
-    order = np.argsort(_interleaved(points[:, 0] >> 16, points[:, 1] >> 16), kind="stable")
+    order = np.argsort(_interleaved(*(points[:, :2] >> np.uint32(16)).T), kind="stable")
     columns = [mi.UInt32(column) for column in points[order].T.copy()]
     dr.eval(columns)
     return columns
@@ -168,8 +168,8 @@ def _sorted(hits: NDArray[np.int32]) -> NDArray[np.int64]:
     """Sort each row in place; how many different vertices it has."""
     counts = np.empty(len(hits), np.int64)
     for i in numba.prange(len(hits)):
-        row = np.sort(hits[i])
-        hits[i] = row
+        row = hits[i]
+        row.sort()
         count = 0
         for k in range(len(row)):
             count += row[k] < BEHIND and (k == 0 or row[k] != row[k - 1])
