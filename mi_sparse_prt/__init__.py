@@ -1,40 +1,49 @@
 """Sparse precomputed radiance transfer for Mitsuba 3."""
 
 import sys as _sys
-from pathlib import Path as _Path
+from importlib import import_module as _import_module
+from types import ModuleType as _ModuleType
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.threads import wait_passively
-from mi_sparse_prt.core.variant import choose_variant, variant
+from mi_sparse_prt.core.variant import choose_variant, point_drjit_to_llvm, variant, with_mitsuba
+
+if _TYPE_CHECKING:  # at run time: on first use, from the modules below
+    from mi_sparse_prt.compression.compress import compress
+    from mi_sparse_prt.emission.cubemap import CubemapLighting
+    from mi_sparse_prt.emission.emitters import SceneEmitters
+    from mi_sparse_prt.emission.environment import Environment, load_environment
+    from mi_sparse_prt.measurement.pixels import camera_pixels
+    from mi_sparse_prt.precompute import precompute, precompute_glossy
+    from mi_sparse_prt.relighting.image import render
+    from mi_sparse_prt.scene.loading import load_scene
+    from mi_sparse_prt.scene.scene import Scene
+    from mi_sparse_prt.storage import load_transport
+    from mi_sparse_prt.transport import GlossyTransport, LightTransport
+    from mi_sparse_prt.validation.validate import Validation, validate
 
 __version__ = "0.1.0"
 
-wait_passively()  # before any compiled function runs
-try:
-    choose_variant()  # before any module that uses Mitsuba's types
-except PrtError as _error:
-    # the command line says one line; Python programs get the exception ("-m": python -m mi_sparse_prt...)
-    if _Path(_sys.argv[0]).name in ("mi-sparse-prt", "-m"):
-        raise SystemExit(f"mi-sparse-prt: {_error}") from None
-    raise
-
-from mi_sparse_prt.compression.compress import compress  # noqa: E402
-from mi_sparse_prt.emission.cubemap import CubemapLighting  # noqa: E402
-from mi_sparse_prt.emission.emitters import SceneEmitters  # noqa: E402
-from mi_sparse_prt.emission.environment import Environment, load_environment  # noqa: E402
-from mi_sparse_prt.measurement.pixels import camera_pixels  # noqa: E402
-from mi_sparse_prt.plugins import register as _register_plugins  # noqa: E402
-from mi_sparse_prt.precompute import precompute, precompute_glossy  # noqa: E402
-from mi_sparse_prt.relighting.image import render  # noqa: E402
-from mi_sparse_prt.scene.loading import load_scene  # noqa: E402
-from mi_sparse_prt.scene.scene import Scene  # noqa: E402
-from mi_sparse_prt.storage import load_transport  # noqa: E402
-from mi_sparse_prt.transport import LightTransport  # noqa: E402
-from mi_sparse_prt.validation.validate import Validation, validate  # noqa: E402
-
-_register_plugins()
-
-GlossyTransport = LightTransport  # one class serves both
+_MODULES = {
+    "CubemapLighting": "emission.cubemap",
+    "Environment": "emission.environment",
+    "GlossyTransport": "transport",
+    "LightTransport": "transport",
+    "Scene": "scene.scene",
+    "SceneEmitters": "emission.emitters",
+    "Validation": "validation.validate",
+    "camera_pixels": "measurement.pixels",
+    "compress": "compression.compress",
+    "load_environment": "emission.environment",
+    "load_scene": "scene.loading",
+    "load_transport": "storage",
+    "precompute": "precompute",
+    "precompute_glossy": "precompute",
+    "render": "relighting.image",
+    "validate": "validation.validate",
+}
 
 __all__ = [
     "CubemapLighting",
@@ -46,7 +55,6 @@ __all__ = [
     "Scene",
     "SceneEmitters",
     "Validation",
-    "__version__",
     "camera_pixels",
     "compress",
     "load_environment",
@@ -57,4 +65,39 @@ __all__ = [
     "render",
     "validate",
     "variant",
+    "__version__",
 ]
+
+
+class _Package(_ModuleType):
+    """The package: its names stay where Python would put a submodule of the same name (``precompute``)."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _MODULES and isinstance(value, _ModuleType)):
+            super().__setattr__(name, value)
+
+
+def __getattr__(name: str) -> _Any:
+    """Import a name when it is used first: with all of them, the package would take two seconds."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = getattr(_import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _prepare_mitsuba() -> None:
+    """Choose the variant, before any module that uses Mitsuba's types, and register the plugins for it."""
+    choose_variant()
+    from mi_sparse_prt.plugins import register
+
+    register()
+
+
+_sys.modules[__name__].__class__ = _Package
+wait_passively()  # before any compiled function runs
+point_drjit_to_llvm()  # before Dr.Jit is imported, which loads one for good
+with_mitsuba(_prepare_mitsuba)

@@ -336,6 +336,9 @@ class LightTransport:
         write_store(path, attributes | {"operators": kinds}, arrays)
 
 
+GlossyTransport = LightTransport  # one class serves both
+
+
 @dataclass(frozen=True)
 class TransposedTransport:
     """T transposed: from importance at points to directions ([Leh07] 2.6).

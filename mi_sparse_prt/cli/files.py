@@ -23,14 +23,18 @@ def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float) -> byt
     return bytes(stream.raw_buffer())
 
 
-def npy_bytes(array: NDArray[np.float32]) -> bytes:
-    """An array as the content of a .npy file."""
+def vertices_bytes(scene: Scene, radiance: NDArray[np.float32], suffix: str) -> bytes:
+    """Radiance of all vertices (n_v, 3) as the content of a .npy or .ply file."""
+    return _npy_bytes(radiance) if suffix == ".npy" else _ply_bytes(scene, radiance)
+
+
+def _npy_bytes(array: NDArray[np.float32]) -> bytes:
     stream = io.BytesIO()
     np.save(stream, array)
     return stream.getvalue()
 
 
-def ply_bytes(scene: Scene, radiance: NDArray[np.float32]) -> bytes:
+def _ply_bytes(scene: Scene, radiance: NDArray[np.float32]) -> bytes:
     """All meshes in world space as one PLY whose ``vertex_color`` is the radiance, as Mitsuba's ``ply`` reads it."""
     triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
     mesh = mi.Mesh("relit", len(radiance), len(triangles), has_vertex_normals=True)

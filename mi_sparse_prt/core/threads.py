@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
-import numba
 from threadpoolctl import ThreadpoolController
 
 Result = TypeVar("Result")
@@ -41,6 +40,8 @@ def one_blas_thread() -> Iterator[None]:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Products, and compiled functions that this thread calls, use no others."""
+    import numba  # 0.3 s, and ``import mi_sparse_prt`` comes by here
+
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:

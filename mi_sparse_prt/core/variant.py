@@ -1,7 +1,8 @@
-"""Chooses the Mitsuba variant in which the package runs, once, before any other module is imported.
+"""Chooses the Mitsuba variant in which the package runs, once, before any module that uses Mitsuba's types.
 
 Plugins and array types exist per variant, so the choice must be made first; and an unfit libLLVM ends the
-whole process the first time a kernel is compiled, so it is looked at before anything runs.
+whole process the first time a kernel is compiled, so it is looked at before anything runs. Both are done as soon as
+Mitsuba is imported, by whomever: what needs no Mitsuba, such as the help of the command line, does not wait for it.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 
 from mi_sparse_prt.core.errors import PrtError
 
@@ -48,7 +52,6 @@ def choose_variant(name: str | None = None) -> str:
     PrtError
         The variant is not one of these two, or has no GPU, or no libLLVM that works.
     """
-    _point_drjit_to_llvm()
     import drjit as dr
     import mitsuba as mi
 
@@ -66,6 +69,62 @@ def choose_variant(name: str | None = None) -> str:
     if mi.variant() != name:
         mi.set_variant(name)
     return name
+
+
+def point_drjit_to_llvm() -> None:
+    """Name a libLLVM that works to Dr.Jit, which loads one as soon as it is imported, and for good.
+
+    No other one is named where Dr.Jit has been imported, or ``DRJIT_LIBLLVM_PATH`` is set.
+    """
+    if "drjit" in sys.modules or "DRJIT_LIBLLVM_PATH" in os.environ:
+        return
+    path = newest_llvm()
+    if path is not None:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(path)
+
+
+def with_mitsuba(then: Callable[[], object]) -> None:
+    """Call a function once, as soon as Mitsuba is imported: now, if it has been, or at the end of its import.
+
+    What the function raises is raised by the import, which can be tried again.
+    """
+    if "mitsuba" in sys.modules:
+        then()
+    else:
+        sys.meta_path.insert(0, _MitsubaAndThen(then))
+
+
+class _MitsubaAndThen(MetaPathFinder, Loader):
+    """Finds and loads Mitsuba as it would be without this, and calls a function when that is done."""
+
+    def __init__(self, then: Callable[[], object]) -> None:
+        self._then = then
+        self._mitsuba: ModuleType | None = None
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name != "mitsuba":
+            return None
+        others = (finder for finder in sys.meta_path if finder is not self)
+        spec = next(filter(None, (finder.find_spec(name, path, target) for finder in others)), None)
+        if spec is not None and spec.loader is not None:
+            self._loader, spec.loader = spec.loader, self
+        return spec
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return self._loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__loader__ = self._loader
+        if module.__spec__ is not None:
+            module.__spec__.loader = self._loader
+        if self._mitsuba is None:
+            self._loader.exec_module(module)  # Mitsuba puts another module into its place, and only once
+            self._mitsuba = sys.modules["mitsuba"]
+        sys.modules["mitsuba"] = self._mitsuba
+        self._then()
+        sys.meta_path.remove(self)
 
 
 def newest_llvm(folders: Iterable[Path] | None = None) -> Path | None:
@@ -86,15 +145,6 @@ def _library_folders() -> list[Path]:
     usual = [f"/usr/lib/{platform.machine()}-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
     own = sorted(Path("/usr/lib").glob("llvm-*/lib"))  # llvm-19/lib and its like
     return [*named, Path(sys.prefix, "lib"), *map(Path, usual), *own]
-
-
-def _point_drjit_to_llvm() -> None:
-    """Name a libLLVM that works to Dr.Jit, which loads one as soon as it is imported, and for good."""
-    if "drjit" in sys.modules or "DRJIT_LIBLLVM_PATH" in os.environ:
-        return
-    path = newest_llvm()
-    if path is not None:
-        os.environ["DRJIT_LIBLLVM_PATH"] = str(path)
 
 
 def _check_llvm(version: tuple[int, int, int] | None) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark import clustered_pca, glossy_transport
-from mi_sparse_prt.cli.tables import cpca_tables, glossy_tables
+from mi_sparse_prt.cli.tables.benchmark import cpca_tables, glossy_tables
 from mi_sparse_prt.scene.scene import Scene
 
 

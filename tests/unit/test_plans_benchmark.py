@@ -8,7 +8,7 @@ from rich.console import Console
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.plan_choice import SLOWER, _judged, measure_plans
-from mi_sparse_prt.cli.tables import plans_tables
+from mi_sparse_prt.cli.tables.benchmark import plans_tables
 from mi_sparse_prt.methods.plan import Plan
 
 

@@ -1,0 +1,171 @@
+"""``mi-sparse-prt benchmark``: speed, error and memory on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.cli.options import (
+    DEFAULT_RESOLUTION,
+    Define,
+    EdgeLength,
+    JsonFile,
+    Method,
+    Quiet,
+    Resolution,
+    SceneFile,
+    Variant,
+    definitions,
+)
+from mi_sparse_prt.cli.running import check_folder, running
+
+WITHOUT_FIGURES = ("", "--plans")
+
+Repeats = Annotated[int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")]
+Methods = Annotated[
+    list[Method] | None,
+    typer.Option(
+        help="Measure time and error of a method against brute force instead; may be repeated.",
+        show_default=False,
+    ),
+]
+Choices = Annotated[
+    bool,
+    typer.Option(
+        "--choices",
+        help="Compare choices of rows and columns, and radii of neighbours, on every mesh instead.",
+    ),
+]
+TimeError = Annotated[
+    bool,
+    typer.Option("--time-error", help="Run every method instead, and compare time and error of all."),
+]
+Plans = Annotated[
+    bool,
+    typer.Option(
+        "--plans", help='Compare what method "auto" chooses with the other plans, carried out, instead.'
+    ),
+]
+Sizes = Annotated[
+    bool,
+    typer.Option(
+        "--sizes", help="Measure cost at 10,000 to 500,000 vertices and resolutions of 8 to 64 instead."
+    ),
+]
+Cpca = Annotated[
+    bool,
+    typer.Option("--cpca", help="Compare clustered PCA in two passes with the standard one instead."),
+]
+Glossy = Annotated[
+    bool,
+    typer.Option("--glossy", help="Measure view-dependent transport of glossy surfaces instead."),
+]
+Figures = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Draw what --method, --choices, --time-error, --sizes, --cpca or --glossy measures: PNG files there.",
+        show_default=False,
+    ),
+]
+
+
+def benchmark(
+    scene: SceneFile,
+    resolution: Resolution = DEFAULT_RESOLUTION,
+    repeats: Repeats = 3,
+    method: Methods = None,
+    choices: Choices = False,
+    time_error: TimeError = False,
+    plans: Plans = False,
+    sizes: Sizes = False,
+    cpca: Cpca = False,
+    glossy: Glossy = False,
+    figures: Figures = None,
+    edge_length: EdgeLength = None,
+    define: Define = None,
+    variant: Variant = None,
+    json_file: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure speed and memory on this machine: the direct matrix against bare rays, paths, relighting.
+
+    Example: mi-sparse-prt benchmark scenes_xml/bunny.xml --json benchmark.json
+
+    With --method sparse --method huang2010 --figures FOLDER: what the paper's tables and figures show, for a scene.
+    With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
+    With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
+    With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
+    images, its Figures 17 to 19.
+
+    Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
+    """
+    asked = {
+        "--method": bool(method),
+        "--choices": choices,
+        "--time-error": time_error,
+        "--plans": plans,
+        "--sizes": sizes,
+        "--cpca": cpca,
+        "--glossy": glossy,
+    }
+    which = _only_one(asked)
+    if figures is not None and which in WITHOUT_FIGURES:
+        others = ", ".join(name for name in asked if name not in WITHOUT_FIGURES)
+        raise typer.BadParameter(f"there are figures of {others} only", param_hint="--figures")
+    if sizes and (edge_length is not None or resolution != DEFAULT_RESOLUTION):
+        raise typer.BadParameter("it varies --edge-length and --resolution itself", param_hint="--sizes")
+    with running(json_file, quiet) as command:
+        if figures is not None:
+            check_folder(figures)
+        parameters, progress = definitions(define), not quiet
+        with command.prompt_interrupts():
+            measure, show = _measurement(which, repeats, method or [])
+            if sizes:
+                command.report = measure(scene, parameters, progress, figures)
+            else:
+                case = prt.load_scene(scene, edge_length, **parameters), prt.CubemapLighting(resolution)
+                drawn = {} if figures is None else {"figures": figures}
+                command.report = measure(*case, progress=progress, **drawn)
+        if figures is not None:
+            command.written.append(figures)
+        command.show(*show(command.report))
+
+
+def _only_one(asked: dict[str, bool]) -> str:
+    """The option that says what to measure, "" if none does."""
+    which = [name for name, given in asked.items() if given]
+    if len(which) > 1:
+        raise typer.BadParameter("one at a time", param_hint=" / ".join(which))
+    return "".join(which)
+
+
+def _measurement(
+    which: str, repeats: int, methods: list[Method]
+) -> tuple[Callable[..., dict[str, Any]], Callable[[dict[str, Any]], list[Table]]]:
+    """What an option asks for: the function that measures it, and the tables of its report."""
+    from mi_sparse_prt import benchmark as benchmarks
+    from mi_sparse_prt.cli.tables import benchmark as tables
+    from mi_sparse_prt.cli.tables.choices import choices_tables
+    from mi_sparse_prt.cli.tables.methods import methods_tables
+
+    kinds: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[dict[str, Any]], list[Table]]]] = {
+        "": (partial(benchmarks.run_benchmark, repeats=repeats), tables.benchmark_tables),
+        "--method": (
+            partial(benchmarks.measure_methods, methods=[method.value for method in methods]),
+            methods_tables,
+        ),
+        "--choices": (benchmarks.measure_choices, choices_tables),
+        "--time-error": (benchmarks.time_against_error, tables.time_error_tables),
+        "--plans": (benchmarks.measure_plans, tables.plans_tables),
+        "--sizes": (benchmarks.cost_against_size, tables.sizes_tables),
+        "--cpca": (benchmarks.measure_cpca, tables.cpca_tables),
+        "--glossy": (benchmarks.measure_glossy, tables.glossy_tables),
+    }
+    return kinds[which]

@@ -1,0 +1,38 @@
+"""Choices of rows and columns, and radii of neighbours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from mi_sparse_prt.cli.tables.layout import new_table, percent
+
+
+def choices_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_choices`` found: relative L2 by choice, and by radius."""
+    return [
+        table
+        for mesh, found in report["meshes"].items()
+        for table in (_choices_table(mesh, found["choices"]), _radius_table(mesh, found["radius"]))
+    ]
+
+
+def _choices_table(mesh: str, choices: dict[str, Any]) -> Table:
+    title = f"{mesh}: {choices['row_share']:.0%} of rows, up to {choices['column_share']:.0%} of columns"
+    table = new_table(title, "", "relative L2", "directions used")
+    for name, error in choices["error"].items():
+        table.add_row(
+            name.replace("_", " "),
+            f"{error:.2%} +- {choices['standard_error'][name]:.2%}",
+            percent(choices["directions"].get(name, 0.0)),
+        )
+    return table
+
+
+def _radius_table(mesh: str, found: dict[str, Any]) -> Table:
+    table = new_table(f"{mesh}: error and radius", "radius", *(f"{radius:g}" for radius in found["radii"]))
+    table.add_row("neighbours", *(f"{count:.0f}" for count in found["neighbours"]))
+    for name, errors in found["error"].items():
+        table.add_row(name.replace("_", " "), *(percent(error) for error in errors))
+    return table
