@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_sparse_prt.benchmark.factor_pictures import factor_picture
-from mi_sparse_prt.benchmark.machine import kept_memory, report_header
+from mi_sparse_prt.benchmark.gallery import factor_picture
+from mi_sparse_prt.benchmark.measuring import kept_memory, report_header, timed
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.glossy import RAYS, TOLERANCE, GlossyTransport, precompute_glossy
@@ -23,10 +24,8 @@ from mi_sparse_prt.scene.materials import kind
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
+from mi_sparse_prt.validation.validate import save_figures
 
-SPP = 16  # of brute force
-ROWS = 64  # vertices that brute force is timed at
-IMAGE_SPP, IMAGE_WIDTH = 512, 320
 STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
 REPEATS = 2  # of which the second counts: all is compiled then
 EVALUATION = (
@@ -39,9 +38,34 @@ EVALUATION = (
 Report = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class GlossyEffort:
+    """How well glossy transport is measured.
+
+    Attributes
+    ----------
+    rows, spp : int
+        Vertices that brute force is timed at, and its paths per element.
+    image_spp, image_width : int
+        Of images.
+    """
+
+    rows: int = 64
+    spp: int = 16
+    image_spp: int = 512
+    image_width: int = 320
+
+
+FULL = GlossyEffort()
+
+
 @kept_memory()
 def measure_glossy(
-    scene: Scene, lighting: CubemapLighting, progress: bool = True, figures: Path | None = None
+    scene: Scene,
+    lighting: CubemapLighting,
+    progress: bool = True,
+    figures: Path | None = None,
+    effort: GlossyEffort = FULL,
 ) -> Report:
     """Measure the transport of a scene with glossy surfaces.
 
@@ -53,6 +77,7 @@ def measure_glossy(
     progress : bool
     figures : path, optional
         Folder for images side by side ([HR10] Figures 17 to 19) and factors of each BRDF, made if needed.
+    effort : GlossyEffort, optional
 
     Returns
     -------
@@ -63,25 +88,22 @@ def measure_glossy(
         each BRDF. ``images``: what ``validate_glossy`` reports, under the scene's environment and another.
     """
     plan = Plan("exact", "gather", rays=RAYS, tolerance=TOLERANCE)
-    dull = diffuse_copy(scene)
+    diffuse_scene = diffuse_copy(scene)
     for _ in range(REPEATS):
-        diffuse = precompute(dull, lighting, method=plan, progress=progress).report["seconds"]
-        start = time.perf_counter()
-        transport = precompute_glossy(scene, lighting, progress=progress)
-        elapsed = time.perf_counter() - start
-    brute = _brute_force(scene, transport) + transport.report["seconds"]["direct"]
+        diffuse = precompute(diffuse_scene, lighting, method=plan, progress=progress).report["seconds"]
+        elapsed, transport = timed(partial(precompute_glossy, scene, lighting, progress=progress))
+    brute = _time_brute_force(scene, transport, effort) + transport.report["seconds"]["direct"]
     seconds = {
         "glossy": elapsed,
         "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
         "brute_force": brute,
     }
-    images = validate_glossy(
-        scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH, progress=progress
-    )
+    spp, width = effort.image_spp, effort.image_width
+    images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, progress=progress)
     if figures is not None:
         images.save(figures)
-        for number, factors in enumerate(transport.factors):
-            factor_picture(factors).savefig(figures / f"factors_{number}.png", dpi=110, bbox_inches="tight")
+        drawn = {f"factors_{k}": factor_picture(factors) for k, factors in enumerate(transport.factors)}
+        save_figures(figures, drawn)
     return {
         **report_header(scene, lighting),
         "parameters": transport.report["parameters"],
@@ -117,37 +139,28 @@ def diffuse_copy(scene: Scene) -> Scene:
     return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=False), float("inf"))
 
 
-def _brute_force(scene: Scene, transport: GlossyTransport) -> float:
-    """Seconds of paths for all elements, white light and all terms at once."""
+def _time_brute_force(scene: Scene, transport: GlossyTransport, effort: GlossyEffort) -> float:
+    """Seconds of paths for all elements, unit-albedo transport and all terms at once."""
     points = vertex_points(scene)
     max_depth = transport.report["parameters"]["max_depth"]
     assert isinstance(transport.direct, FactoredVisibility)
-    paths = TermPaths(scene.normalised, transport.direct, points, max_depth, SPP)
+    paths = TermPaths(scene.normalised, transport.direct, points, max_depth, effort.spp)
     every = transport.lighting.n_directions
-    chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]
-    for some in np.split(chosen, [ROWS]):  # the second half counts
-        start = time.perf_counter()
-        paths.elements(np.repeat(some, every), np.tile(np.arange(every), len(some)))
-        elapsed = time.perf_counter() - start
-    return elapsed / ROWS * len(points)
+    chosen = np.random.default_rng(0).permutation(len(points))[: 2 * effort.rows]
+    for some in np.split(chosen, [effort.rows]):  # the second half counts
+        place = np.repeat(some, every), np.tile(np.arange(every), len(some))
+        elapsed, _ = timed(paths.elements, *place)
+    return elapsed / effort.rows * len(points)
 
 
 def _factor_errors(scene: Scene, transport: GlossyTransport) -> list[Report]:
-    found = []
+    errors = []
     for number, factors in enumerate(transport.factors):
         vertex = int(np.flatnonzero(transport.material == number)[0])
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )
         error = factor_error(factors, material.bsdf, mesh.name)
-        found.append(
-            {
-                "mesh": mesh.name,
-                "bsdf": kind(material.bsdf),
-                "terms": factors.terms,
-                "whole": error.whole.tolist(),
-                "grazing": error.grazing.tolist(),
-                "peak": error.peak.tolist(),
-            }
-        )
-    return found
+        regions = {name: getattr(error, name).tolist() for name in ("whole", "grazing", "peak")}
+        errors.append({"mesh": mesh.name, "bsdf": kind(material.bsdf), "terms": factors.terms} | regions)
+    return errors
