@@ -6,7 +6,7 @@ from mi_sparse_prt.benchmark.glossy_transport import measure_glossy
 from mi_sparse_prt.benchmark.method_comparison import measure_methods
 from mi_sparse_prt.benchmark.plan_choice import measure_plans
 from mi_sparse_prt.benchmark.row_column_choices import measure_choices
-from mi_sparse_prt.benchmark.sizes import cost_against_size
+from mi_sparse_prt.benchmark.size_costs import cost_against_size
 from mi_sparse_prt.benchmark.speed import run_benchmark
 from mi_sparse_prt.benchmark.time_error import time_against_error
 

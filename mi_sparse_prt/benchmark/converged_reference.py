@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.brute_force_time import RowsTime, time_rows
-from mi_sparse_prt.benchmark.direct_error import BLOCK, DirectError, direct_error, worst
-from mi_sparse_prt.benchmark.estimates import (
+from mi_sparse_prt.benchmark.brute_force import RowsTime, time_rows
+from mi_sparse_prt.benchmark.direct_error import BLOCK, DirectError, direct_error
+from mi_sparse_prt.benchmark.measuring import timed
+from mi_sparse_prt.benchmark.sampled_norms import (
     MeanSquare,
     joint_relative_l2,
     mean_square,
-    relative_l2,
-    row_errors,
+    sampled_relative_l2,
 )
+from mi_sparse_prt.core.metrics import relative_l2_of_rows, worst_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.operator import Operator
@@ -30,13 +31,56 @@ from mi_sparse_prt.transport import LightTransport
 
 MAX_DEPTH = 5
 SPP = 16
-VERTICES = 10_000  # at random, as many from each mesh
-TEXELS = 3  # of a vertex, at random: errors differ mostly between vertices
-ELEMENT_SPP = 6144  # of each of the two halves: noise below 0.3% of the matrix
-ROWS, ROW_SPP = 96, 32  # whole rows, as many from each mesh; of each half
 SEED = 1 << 30  # the methods' seeds are small
 
-Halves = tuple[NDArray[np.float64], NDArray[np.float64]]
+Doubles = NDArray[np.float64]
+Halves = tuple[Doubles, Doubles]
+
+
+@dataclass(frozen=True)
+class ReferenceEffort:
+    """How much of the indirect light a reference knows, and how well.
+
+    Attributes
+    ----------
+    vertices : int
+        At random, as many from each mesh.
+    texels : int
+        Of a vertex, at random: errors differ mostly between vertices.
+    element_spp : int
+        Paths of an element in each of two halves: 6144 leave noise below 0.3% of the matrix.
+    rows, row_spp : int
+        Whole rows, as many from each mesh, and paths of their elements in each half.
+    """
+
+    vertices: int = 10_000
+    texels: int = 3
+    element_spp: int = 6144
+    rows: int = 96
+    row_spp: int = 32
+
+
+CONVERGED = ReferenceEffort()
+
+
+@dataclass(frozen=True)
+class KnownElements:
+    """Indirect light of some elements of a mesh, in two independent halves.
+
+    Attributes
+    ----------
+    ids, texels : (k,), (k, t) integers
+    halves : two of (k, t, channels) float64
+    """
+
+    ids: NDArray[np.int64]
+    texels: NDArray[np.int64]
+    halves: Halves
+
+    def square(self, indirect: Doubles) -> MeanSquare:
+        """Squared errors of indirect light (k, t, channels), where direct light is exact."""
+        x, y = (indirect - half for half in self.halves)
+        return mean_square(0.0, np.zeros(1), x, y)
 
 
 class Reference:
@@ -47,8 +91,7 @@ class Reference:
     scene : Scene
     lighting : CubemapLighting
     progress : bool
-    spp : int, optional
-        Paths per element of each half, 6144 if not given; with fewer it is done sooner, and noisier.
+    effort : ReferenceEffort, optional
 
     Attributes
     ----------
@@ -56,33 +99,37 @@ class Reference:
         Exact bits of all vertices.
     direct_seconds : float
         What they took, compilation left out.
-    vertices, texels : dict
-        Mesh name -> (k,) and (k, t) integers: elements at which indirect light is known.
+    elements : dict
+        Mesh name -> elements at which indirect light is known.
     """
 
     def __init__(
-        self, scene: Scene, lighting: CubemapLighting, progress: bool, spp: int | None = None
+        self, scene: Scene, lighting: CubemapLighting, progress: bool, effort: ReferenceEffort = CONVERGED
     ) -> None:
         self.scene, self.lighting, self.points = scene, lighting, vertex_points(scene)
+        self._meshes = {mesh.name: mesh.vertices for mesh in scene.meshes}
+        self._sizes = {name: inside.stop - inside.start for name, inside in self._meshes.items()}
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3].astype(np.float64)
-        bits, self.direct_seconds = self._direct()
+        self.direct_seconds, bits = self._trace_direct()
         self.direct = Visibility(bits, scene.normals, lighting)
-        self._direct_squares = {mesh.name: self._direct_square(mesh.vertices) for mesh in scene.meshes}
-        rng = np.random.default_rng(1)
-        self.vertices = self._some_of_each(VERTICES, rng)
-        self.texels = {
-            name: rng.integers(lighting.n_directions, size=(len(ids), TEXELS))
-            for name, ids in self.vertices.items()
+        rng, every = np.random.default_rng(1), np.arange(lighting.n_directions)
+        vertices = self._draw_vertices(effort.vertices, rng)
+        texels = {
+            name: rng.integers(len(every), size=(len(ids), effort.texels)) for name, ids in vertices.items()
         }
-        self._halves = {
-            name: (
-                self._elements(name, spp or ELEMENT_SPP, SEED, progress),
-                self._elements(name, spp or ELEMENT_SPP, SEED + 1, progress),
-            )
-            for name in self.vertices
+        self.elements = {
+            name: self._trace(name, ids, texels[name], effort.element_spp, SEED, progress)
+            for name, ids in vertices.items()
         }
-        self._rows = self._some_of_each(ROWS, rng)
-        self._row_halves = {name: self._whole_rows(name, progress) for name in self._rows}
+        self._norms = {
+            name: mean_square(self._direct_square(name), self._values(self.direct, known), *known.halves)
+            for name, known in self.elements.items()
+        }
+        rows = self._draw_vertices(effort.rows, rng)
+        self._rows = {
+            name: self._trace(name, ids, np.tile(every, (len(ids), 1)), effort.row_spp, SEED + 2, progress)
+            for name, ids in rows.items()
+        }
 
     def paths(self, spp: int, seed: int) -> PathSolver:
         """A solver for indirect light at the scene's vertices."""
@@ -93,68 +140,8 @@ class Reference:
         return AdjointSolver(*self._problem(spp, 0))
 
     def _problem(self, spp: int, seed: int) -> tuple[Any, ...]:
-        channels = 1 if self.scene.grey else 3
+        channels = self._albedo.shape[1]
         return self.scene.normalised, self.lighting, self.points, "direction", MAX_DEPTH, spp, channels, seed
-
-    def _some_of_each(self, count: int, rng: np.random.Generator) -> dict[str, NDArray[np.int64]]:
-        """Mesh name -> some of its vertices, so many in all, or all that it has."""
-        of_each, found = max(1, count // len(self.scene.meshes)), {}
-        for mesh in self.scene.meshes:
-            n = mesh.vertices.stop - mesh.vertices.start
-            chosen = rng.choice(n, min(n, of_each), replace=False)
-            found[mesh.name] = mesh.vertices.start + np.sort(chosen)
-        return found
-
-    def _direct(self) -> tuple[NDArray[Any], float]:
-        solver = DirectSolver(self.scene.normalised, self.lighting, self.points)
-        stored = solver.row_storage(len(self.points))
-        solver.rows(np.arange(min(16, len(stored)), dtype=np.uint32))  # compiles
-        start = time.perf_counter()
-        for a in range(0, len(stored), solver.block_size):
-            ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
-            stored[a : a + len(ids)] = solver.rows(ids)
-        return stored, time.perf_counter() - start
-
-    def _elements(self, name: str, spp: int, seed: int, progress: bool) -> NDArray[np.float64]:
-        """Indirect light (k, t, channels) of the chosen elements of a mesh."""
-        ids, texels, solver = self.vertices[name], self.texels[name], self.paths(spp, seed)
-        parts, step = [], max(1, solver.block_elements // texels.shape[1])  # a wavefront
-        for a in tqdm(range(0, len(ids), step), desc=f"reference {name}", disable=not progress):
-            some = texels[a : a + step]
-            mean = solver.elements(np.repeat(ids[a : a + step], some.shape[1]), some.ravel()).mean
-            parts.append(mean.reshape(*some.shape, -1))
-        solid_angles = self.lighting.solid_angles[texels].astype(np.float64)[..., None]
-        return self._reflected(ids, np.concatenate(parts) * solid_angles)
-
-    def _reflected(self, ids: NDArray[np.int64], white: NDArray[np.floating]) -> NDArray[np.float64]:
-        """What vertices (k,) send out, (k, t, channels), of white transport (k, t, 1 or channels)."""
-        return self._albedo[ids][:, None] * white
-
-    def _whole_rows(self, name: str, progress: bool) -> Halves:
-        """Indirect light (k, n_directions, channels) of the chosen rows of a mesh, twice."""
-        ids, found = self._rows[name], []
-        for seed in (SEED + 2, SEED + 3):
-            solver = self.paths(ROW_SPP, seed)
-            blocks = range(0, len(ids), solver.block_size)
-            bar = tqdm(blocks, desc=f"reference rows {name}", disable=not progress)
-            rows = [solver.rows(ids[a : a + solver.block_size]).mean for a in bar]
-            found.append(self._sent_out(ids, np.concatenate(rows)))
-        return found[0], found[1]
-
-    def _sent_out(self, ids: NDArray[np.int64], rows: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What vertices (k,) send out, of white transport per solid angle, (k, n_directions, channels)."""
-        return self._reflected(ids, rows * self.lighting.solid_angles.astype(np.float64)[:, None])
-
-    def time_brute_force(self) -> dict[str, Any]:
-        """Seconds that all elements would take with as many paths each as the methods have."""
-        paths = self.time_paths(SPP)
-        return {
-            "direct_seconds": self.direct_seconds,
-            "paths_seconds": paths.seconds,
-            "paths_seconds_standard_error": paths.standard_error,
-            "seconds": self.direct_seconds + paths.seconds,
-            "rows": paths.rows,
-        }
 
     def time_paths(self, spp: int) -> RowsTime:
         """Seconds of all indirect elements by so many paths each, a wavefront at a time."""
@@ -166,46 +153,16 @@ class Reference:
         solver = self.adjoint(spp)
         return time_rows(solver, max(1, 2 * solver.block_size // solver.spp))
 
-    def noise(self) -> dict[str, float]:
-        """Relative L2 noise of the mean of both halves, per mesh."""
-        noise = {}
-        for name, (x, y) in self._halves.items():
-            norm = self._norm(name).value
-            noise[name] = float(np.sqrt(((x - y) ** 2).mean() / 4 / norm)) if norm else 0.0
-        return noise
+    # ------------------------------------------------------------------------------------------------- errors
 
-    def total_noise(self) -> float:
-        """The same for all meshes together."""
-        square, norm = 0.0, 0.0
-        for name, (x, y) in self._halves.items():
-            square += self._size(name) * float(((x - y) ** 2).mean()) / 4
-            norm += self._size(name) * self._norm(name).value
-        return float(np.sqrt(square / norm)) if norm else 0.0
-
-    def brute_force_errors(self) -> dict[str, dict[str, Any]]:
-        """Relative L2 per mesh of what brute force gives: its direct light is exact, its indirect light noisy."""
-        found = {}
-        for name in self.vertices:
-            value, deviation = relative_l2(self._noise_of_paths(name, SPP), self._norm(name))
-            found[name] = {
-                "total": value,
-                "direct": 0.0,
-                "indirect": value,
-                "standard_error": {"total": deviation, "indirect": deviation},
+    def noise(self) -> dict[str, Any]:
+        """Relative L2 noise of the mean of both halves, in the form of ``relative_l2``."""
+        return self._relative(
+            {
+                name: MeanSquare(0.0, (np.subtract(*known.halves) ** 2 / 4).mean(axis=(1, 2)))
+                for name, known in self.elements.items()
             }
-        return found
-
-    def relative_l2_of_paths(self, spp: int) -> dict[str, Any]:
-        """What brute force gives with so many paths, in the form of ``relative_l2``."""
-        return self._relative({name: self._noise_of_paths(name, spp) for name in self.vertices})
-
-    def relative_l2_of_adjoint(self, spp: int) -> dict[str, Any]:
-        """What exact direct light and adjoint rows of so many samples give, from the reference's whole rows."""
-        solver, squares = self.adjoint(spp), {}
-        for name, ids in self._rows.items():
-            rows = self._sent_out(ids, solver.rows(ids).mean)
-            squares[name] = self._square_of(rows, self._row_halves[name])
-        return self._relative(squares)
+        )
 
     def relative_l2(self, transport: LightTransport) -> dict[str, Any]:
         """Relative L2 of a matrix.
@@ -221,52 +178,62 @@ class Reference:
             both again. The form of ``report["estimated_error"]``.
         """
         direct = direct_error(self.direct, transport)
-        return self._relative({name: self._squares(name, transport, direct)[0] for name in self.vertices})
+        return self._relative({name: self._squares(name, transport, direct)[0] for name in self._meshes})
+
+    def relative_l2_of_paths(self, spp: int) -> dict[str, Any]:
+        """What brute force gives with so many paths, in the form of ``relative_l2``: its direct light is exact."""
+        solver = self.paths(spp, 0)
+        return self._relative(
+            {
+                name: known.square(self._trace_once(known.ids, known.texels, solver))
+                for name, known in self.elements.items()
+            }
+        )
+
+    def relative_l2_of_adjoint(self, spp: int) -> dict[str, Any]:
+        """What exact direct light and adjoint rows of so many samples give, from the reference's whole rows."""
+        solver = self.adjoint(spp)
+        return self._relative(
+            {
+                name: known.square(self._per_texel(known.ids, known.texels, solver.rows(known.ids).mean))
+                for name, known in self._rows.items()
+            }
+        )
 
     def errors(self, transport: LightTransport) -> tuple[dict[str, dict[str, Any]], DirectError]:
         """Errors per mesh (see ``measure_methods``), and all about those of the direct part."""
-        direct, found = direct_error(self.direct, transport), {}
-        for name in self.vertices:
-            total, alone = (
-                relative_l2(square, self._norm(name)) for square in self._squares(name, transport, direct)
+        direct, errors = direct_error(self.direct, transport), {}
+        for name in self._meshes:
+            total, indirect = (
+                sampled_relative_l2(square, self._norms[name])
+                for square in self._squares(name, transport, direct)
             )
-            found[name] = {
+            errors[name] = {
                 "total": total[0],
                 "direct": direct.relative_l2(name),
-                "indirect": alone[0],
-                "standard_error": {"total": total[1], "indirect": alone[1]},
+                "indirect": indirect[0],
+                "standard_error": {"total": total[1], "indirect": indirect[1]},
                 "rows": self._row_error(transport, name),
-                "direct_rows": direct.worst_rows(name),
-                "direct_columns": direct.worst_columns(name),
+                "direct_rows": direct.row_errors(name),
+                "direct_columns": direct.column_errors(name),
             }
-        return found, direct
+        return errors, direct
 
     def _squares(
         self, name: str, transport: LightTransport, direct: DirectError
     ) -> tuple[MeanSquare, MeanSquare]:
         """Squared errors of the matrix of a mesh, and of its indirect part alone."""
-        indirect = self._at_elements(transport.operators.get("indirect"), name)
-        x, y = (indirect - half for half in self._halves[name])
-        wrong = self._at_elements(transport.operators["direct"], name) - self._exact(name)
-        total = mean_square(direct.mean_square(name), np.broadcast_to(wrong, x.shape), x, y)
-        return total, self._square_of(indirect, self._halves[name])
-
-    def _noise_of_paths(self, name: str, spp: int) -> MeanSquare:
-        return self._square_of(self._elements(name, spp, 0, progress=False), self._halves[name])
-
-    @staticmethod
-    def _square_of(indirect: NDArray[np.float64], halves: Halves) -> MeanSquare:
-        """Squared errors of indirect light (k, ..., channels), where direct light is exact."""
-        x, y = (indirect - half for half in halves)
-        return mean_square(0.0, np.zeros_like(x), x, y)
+        known = self.elements[name]
+        indirect = self._values(transport.indirect, known)
+        x, y = (indirect - half for half in known.halves)
+        wrong = self._values(transport.direct, known) - self._values(self.direct, known)
+        return mean_square(direct.mean_square(name), wrong, x, y), known.square(indirect)
 
     def _relative(self, squares: dict[str, MeanSquare]) -> dict[str, Any]:
         """Squared errors of all meshes in the form of ``relative_l2``."""
-        norms = {name: self._norm(name) for name in squares}
-        meshes = {name: relative_l2(square, norms[name]) for name, square in squares.items()}
-        total = joint_relative_l2(
-            list(squares.values()), list(norms.values()), [self._size(name) for name in squares]
-        )
+        norms = [self._norms[name] for name in squares]
+        meshes = {name: sampled_relative_l2(square, self._norms[name]) for name, square in squares.items()}
+        total = joint_relative_l2(list(squares.values()), norms, [self._sizes[name] for name in squares])
         return {
             "total": total[0],
             "meshes": {name: value for name, (value, _) in meshes.items()},
@@ -276,42 +243,82 @@ class Reference:
             },
         }
 
-    def _size(self, name: str) -> int:
-        """Vertices of a mesh."""
-        inside = next(mesh.vertices for mesh in self.scene.meshes if mesh.name == name)
-        return int(inside.stop - inside.start)
+    def _row_error(self, transport: LightTransport, name: str) -> dict[str, Any]:
+        """95th percentile and maximum of the relative L2 of whole rows."""
+        known = self._rows[name]
+        exact, (x, y) = self._values(self.direct, known), known.halves
+        ours = self._values(transport.direct, known) + self._values(transport.indirect, known)
+        squares = ((ours - exact - x) * (ours - exact - y)).sum(axis=(1, 2))
+        errors = relative_l2_of_rows(squares, ((exact + x) * (exact + y)).sum(axis=(1, 2)))
+        return worst_rows(errors, known.ids, "vertex") | {"rows": len(known.ids)}
 
-    def _at_elements(self, part: Operator | None, name: str) -> NDArray[np.float64]:
-        """What a part of a matrix sends out at the elements of a mesh, (k, t, channels); 0 where there is none."""
-        ids, texels = self.vertices[name], self.texels[name]
+    # ------------------------------------------------------------------------------------- values of elements
+
+    def _draw_vertices(self, count: int, rng: np.random.Generator) -> dict[str, NDArray[np.int64]]:
+        """Mesh name -> some of its vertices, so many in all, or all that it has."""
+        of_each = max(1, count // len(self._meshes))
+        return {
+            name: self._meshes[name].start + np.sort(rng.choice(n, min(n, of_each), replace=False))
+            for name, n in self._sizes.items()
+        }
+
+    def _trace_direct(self) -> tuple[float, NDArray[Any]]:
+        solver = DirectSolver(self.scene.normalised, self.lighting, self.points)
+        stored = solver.row_storage(len(self.points))
+        solver.rows(np.arange(min(16, len(stored)), dtype=np.uint32))  # compiles
+
+        def trace() -> None:
+            for a in range(0, len(stored), solver.block_size):
+                ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
+                stored[a : a + len(ids)] = solver.rows(ids)
+
+        return timed(trace)[0], stored
+
+    def _trace(
+        self,
+        name: str,
+        ids: NDArray[np.int64],
+        texels: NDArray[np.int64],
+        spp: int,
+        seed: int,
+        progress: bool,
+    ) -> KnownElements:
+        """Indirect light of elements of a mesh, twice."""
+        title = f"reference {name}" if progress else None
+        x, y = (self._trace_once(ids, texels, self.paths(spp, seed + k), title) for k in (0, 1))
+        return KnownElements(ids, texels, (x, y))
+
+    def _trace_once(
+        self, ids: NDArray[np.int64], texels: NDArray[np.int64], solver: PathSolver, title: str | None = None
+    ) -> Doubles:
+        """Indirect light (k, t, channels) of elements; a bar if there is a title."""
+        parts, step = [], max(1, solver.block_elements // texels.shape[1])  # a wavefront
+        for a in tqdm(range(0, len(ids), step), desc=title, disable=title is None):
+            some = texels[a : a + step]
+            mean = solver.elements(np.repeat(ids[a : a + step], some.shape[1]), some.ravel()).mean
+            parts.append(mean.reshape(*some.shape, -1))
+        return self._per_texel(ids, texels, np.concatenate(parts))
+
+    def _per_texel(
+        self, ids: NDArray[np.int64], texels: NDArray[np.int64], density: NDArray[np.floating]
+    ) -> Doubles:
+        """Elements of T from unit-albedo transport per solid angle (k, t, channels)."""
+        solid_angles = self.lighting.solid_angles[texels].astype(np.float64)
+        return self._albedo[ids][:, None] * (density * solid_angles[..., None])
+
+    def _values(self, part: Operator | None, known: KnownElements) -> Doubles:
+        """A part of a matrix at elements, (k, t, channels); 0 where there is none."""
         if part is None:
-            return np.zeros((*texels.shape, 1))
-        white = part.elements(np.repeat(ids, texels.shape[1]), texels.ravel())
-        return self._reflected(ids, white.reshape(*texels.shape, -1))
+            return np.zeros((*known.texels.shape, 1))
+        ids = np.repeat(known.ids, known.texels.shape[1])
+        unit_albedo = part.elements(ids, known.texels.ravel()).reshape(*known.texels.shape, -1)
+        return self._albedo[known.ids][:, None] * unit_albedo
 
-    def _exact(self, name: str) -> NDArray[np.float64]:
-        """Direct light at the elements of a mesh, (k, t, channels)."""
-        return self._at_elements(self.direct, name)
-
-    def _norm(self, name: str) -> MeanSquare:
-        exact, (x, y) = self._exact(name), self._halves[name]
-        return mean_square(self._direct_squares[name], np.broadcast_to(exact, x.shape), x, y)
-
-    def _direct_square(self, inside: slice) -> float:
+    def _direct_square(self, name: str) -> float:
         """Mean square of the direct elements of a mesh."""
-        total = 0.0
+        total, inside = 0.0, self._meshes[name]
         for a in range(inside.start, inside.stop, BLOCK):
             ids = np.arange(a, min(a + BLOCK, inside.stop))
             squares = (self.direct.rows(ids)[..., 0] ** 2).sum(axis=1, dtype=np.float64)
             total += float(squares @ (self._albedo[ids] ** 2).mean(axis=1))
-        return total / ((inside.stop - inside.start) * self.lighting.n_directions)
-
-    def _row_error(self, transport: LightTransport, name: str) -> dict[str, Any]:
-        """95th percentile and maximum of the relative L2 of whole rows."""
-        ids, (x, y) = self._rows[name], self._row_halves[name]
-        exact = self._reflected(ids, self.direct.rows(ids))
-        ours = sum(self._reflected(ids, operator.rows(ids)) for operator in transport.operators.values())
-        squares = ((ours - exact - x) * (ours - exact - y)).sum(axis=(1, 2))
-        relative = row_errors(squares, ((exact + x) * (exact + y)).sum(axis=(1, 2)))
-        found = worst(relative, 0, "vertex")
-        return found | {"vertex": int(ids[found["vertex"]]), "rows": len(ids)}
+        return total / (self._sizes[name] * self.lighting.n_directions)

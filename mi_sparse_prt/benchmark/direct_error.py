@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.benchmark.estimates import row_errors
+from mi_sparse_prt.core.metrics import relative_l2_from_squares, relative_l2_of_rows, worst_rows
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.transport import LightTransport
 
 BLOCK = 512  # rows at a time: tens of megabytes, and those of their dense vertices
-LIT = (
-    0.1  # of the largest norm: columns below it light next to nothing, and have no relative error to speak of
-)
+LIT = 0.1  # of the largest norm: columns below it light next to nothing, their relative error says nothing
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,8 @@ class DirectError:
 
     def relative_l2(self, mesh: str) -> float:
         """Over the whole direct matrix of a mesh."""
-        square, norm = (float(a[self.meshes[mesh]].sum()) for a in (self.rows, self.row_norms))
-        return float(np.sqrt(square / norm)) if norm else 0.0
+        inside = self.meshes[mesh]
+        return float(relative_l2_from_squares(self.rows[inside].sum(), self.row_norms[inside].sum()))
 
     def mean_square(self, mesh: str) -> float:
         """Mean squared error of an element of a mesh."""
@@ -50,29 +48,20 @@ class DirectError:
         """Relative L2 (n_v,) of every row."""
         relative = np.empty(len(self.rows))
         for inside in self.meshes.values():
-            relative[inside] = row_errors(self.rows[inside], self.row_norms[inside])
+            relative[inside] = relative_l2_of_rows(self.rows[inside], self.row_norms[inside])
         return relative
 
-    def worst_rows(self, mesh: str) -> dict[str, Any]:
+    def row_errors(self, mesh: str) -> dict[str, Any]:
         """95th percentile and maximum of the relative L2 of rows, and its vertex."""
         inside = self.meshes[mesh]
-        return worst(row_errors(self.rows[inside], self.row_norms[inside]), inside.start, "vertex")
+        errors = relative_l2_of_rows(self.rows[inside], self.row_norms[inside])
+        return worst_rows(errors, np.arange(inside.start, inside.stop), "vertex")
 
-    def worst_columns(self, mesh: str) -> dict[str, Any]:
+    def column_errors(self, mesh: str) -> dict[str, Any]:
         """The same for columns (light from a single texel), of those that light the mesh."""
         lit = np.flatnonzero(self.column_norms[mesh] >= LIT**2 * self.column_norms[mesh].max())
-        relative = row_errors(self.columns[mesh][lit], self.column_norms[mesh][lit])
-        found = worst(relative, 0, "texel")
-        return found | {"texel": int(lit[found["texel"]])}
-
-
-def worst(relative: NDArray[np.float64], start: int, name: str) -> dict[str, Any]:
-    """95th percentile, maximum, and where that is, counted from ``start``."""
-    return {
-        "95th_percentile": float(np.percentile(relative, 95)),
-        "max": float(relative.max()),
-        name: start + int(relative.argmax()),
-    }
+        errors = relative_l2_of_rows(self.columns[mesh][lit], self.column_norms[mesh][lit])
+        return worst_rows(errors, lit, "texel")
 
 
 def direct_error(exact: Visibility, transport: LightTransport) -> DirectError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.benchmark.kernels import recorded_kernels
+from mi_sparse_prt.benchmark.kernels import launched_kernels
+from mi_sparse_prt.benchmark.measuring import timed
 from mi_sparse_prt.core.profiling import peak_memory, reset_peak_memory
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
@@ -86,12 +87,12 @@ def measure_direct(
         bits[start:stop] = solver.rows(np.arange(start, stop, dtype=np.uint32))
 
     reset_peak_memory()
-    begin = time.perf_counter()
-    with recorded_kernels() as kernels:
+
+    def fill_all() -> None:
         for block in blocks:
             fill(*block)
-    first_run = time.perf_counter() - begin
 
+    first_run, kernels = timed(launched_kernels, fill_all)
     bare_visible = sum(bare.count_visible(*block) for block in blocks)
     rays = sum(bare.count_rays(*block) for block in blocks)
     runs = [_alternating(fill, bare.count_visible, blocks, repeat) for repeat in range(repeats)]
@@ -115,12 +116,15 @@ def measure_direct(
     }, bits
 
 
-def _alternating(ours: Any, bare: Any, blocks: list[tuple[int, int]], repeat: int) -> tuple[float, float]:
+def _alternating(
+    ours: Callable[[int, int], Any],
+    bare: Callable[[int, int], Any],
+    blocks: list[tuple[int, int]],
+    repeat: int,
+) -> tuple[float, float]:
     """Seconds of two ways to do the same blocks, in turn."""
     seconds = [0.0, 0.0]
     for k, block in enumerate(blocks):
         for way in (0, 1) if (k + repeat) % 2 == 0 else (1, 0):
-            start = time.perf_counter()
-            (ours, bare)[way](*block)
-            seconds[way] += time.perf_counter() - start
+            seconds[way] += timed((ours, bare)[way], *block)[0]
     return seconds[0], seconds[1]

@@ -24,17 +24,25 @@ def mesh_named(scene: Scene, name: str) -> Mesh:
     return found
 
 
-def traced_rows(direct: DirectSolver, ids: NDArray[np.integer]) -> Bits:
+def trace_visibility(direct: DirectSolver, ids: NDArray[np.integer]) -> Bits:
     """Visibility (n, words) of whole rows, every element traced."""
     blocks = [direct.rows(ids[a : a + direct.block_size]) for a in range(0, len(ids), direct.block_size)]
     return np.concatenate([direct.row_storage(0), *blocks]).astype(np.uint32, copy=False)
 
 
-def white_rows(bits: Bits, normals: NDArray[np.float32], lighting: CubemapLighting) -> NDArray[np.float32]:
-    """White direct transport (n, n_directions) of visibility bits, cosine and solid angle included."""
+def unit_albedo_rows(
+    bits: Bits, normals: NDArray[np.float32], lighting: CubemapLighting
+) -> NDArray[np.float32]:
+    """Unit-albedo direct transport (n, n_directions) of visibility bits, cosine and solid angle included."""
     rows = np.empty((len(bits), lighting.n_directions), np.float32)
     visibility = Visibility(bits, normals, lighting)
     for a in range(0, len(rows), ROWS):
         ids = np.arange(a, min(a + ROWS, len(rows)))
         rows[ids] = visibility.rows(ids)[..., 0]
     return rows
+
+
+def values_at(rows: NDArray[np.float32], directions: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Values (n, s) of rows (n, n_directions) at their directions (n, s); 0 at -1, where there are fewer."""
+    values = np.take_along_axis(rows, np.maximum(directions, 0), axis=1)
+    return np.where(directions >= 0, values, np.float32(0))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from mi_sparse_prt.benchmark.factor_pictures import factor_picture
-from mi_sparse_prt.benchmark.machine import kept_memory, report_header
+from mi_sparse_prt.benchmark.gallery import factor_picture
+from mi_sparse_prt.benchmark.measuring import kept_memory, report_header, timed
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.measurement.measurement import mesh_vertices
@@ -25,10 +25,8 @@ from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
+from mi_sparse_prt.validation.validate import save_figures
 
-SPP = 16  # of brute force
-ROWS = 64  # vertices that brute force is timed at
-IMAGE_SPP, IMAGE_WIDTH = 512, 320
 STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
 TERMS = 4
 REPEATS = 2  # of which the second counts: all is compiled then
@@ -42,9 +40,34 @@ EVALUATION = (
 Report = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class GlossyEffort:
+    """How well glossy transport is measured.
+
+    Attributes
+    ----------
+    rows, spp : int
+        Vertices that brute force is timed at, and its paths per element.
+    image_spp, image_width : int
+        Of images.
+    """
+
+    rows: int = 64
+    spp: int = 16
+    image_spp: int = 512
+    image_width: int = 320
+
+
+FULL = GlossyEffort()
+
+
 @kept_memory()
 def measure_glossy(
-    scene: Scene, lighting: CubemapLighting, progress: bool = True, figures: Path | None = None
+    scene: Scene,
+    lighting: CubemapLighting,
+    progress: bool = True,
+    figures: Path | None = None,
+    effort: GlossyEffort = FULL,
 ) -> Report:
     """Measure the transport of a scene with glossy surfaces.
 
@@ -56,6 +79,7 @@ def measure_glossy(
     progress : bool
     figures : path, optional
         Folder for images side by side ([HR10] Figures 17 to 19) and factors of each BRDF, made if needed.
+    effort : GlossyEffort, optional
 
     Returns
     -------
@@ -66,23 +90,24 @@ def measure_glossy(
         each BRDF. ``images``: what ``validate_glossy`` reports, under the scene's environment and another.
     """
     plan = Plan("exact", "gather", rays=64, tolerance=0.06)
-    dull = diffuse_copy(scene)
+    diffuse_scene = diffuse_copy(scene)
     for _ in range(REPEATS):
-        diffuse = precompute(dull, lighting, method=plan, progress=progress).report["seconds"]
+        diffuse = precompute(diffuse_scene, lighting, method=plan, progress=progress).report["seconds"]
         transport = precompute(scene, lighting, method=plan, terms=TERMS, progress=progress)
-    brute = _brute_force(scene, transport) + transport.report["seconds"]["direct"]
+    brute = _time_brute_force(scene, transport, effort) + transport.report["seconds"]["direct"]
     seconds = {
         "glossy": sum(transport.report["seconds"].get(name, 0.0) for name in EVALUATION),
         "diffuse": sum(diffuse.get(name, 0.0) for name in EVALUATION),
         "brute_force": brute,
     }
-    images = validate_glossy(
-        scene, transport, _environments(scene), spp=IMAGE_SPP, width=IMAGE_WIDTH, progress=progress
-    )
+    spp, width = effort.image_spp, effort.image_width
+    images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, progress=progress)
     if figures is not None:
         images.save(figures)
-        for number, factors in enumerate(_factors(transport).factors):
-            factor_picture(factors).savefig(figures / f"factors_{number}.png", dpi=110, bbox_inches="tight")
+        drawn = {
+            f"factors_{k}": factor_picture(factors) for k, factors in enumerate(_surfaces(transport).factors)
+        }
+        save_figures(figures, drawn)
     return {
         **report_header(scene, lighting),
         "parameters": transport.report["parameters"],
@@ -118,42 +143,34 @@ def diffuse_copy(scene: Scene) -> Scene:
     return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=False), float("inf"))
 
 
-def _brute_force(scene: Scene, transport: LightTransport) -> float:
-    """Seconds of paths for all elements, white light and all terms at once."""
+def _time_brute_force(scene: Scene, transport: LightTransport, effort: GlossyEffort) -> float:
+    """Seconds of paths for all elements, unit-albedo transport and all terms at once."""
     points, max_depth = vertex_points(scene), transport.report["parameters"]["max_depth"]
-    here = mesh_vertices(scene)
-    problem = Problem(scene, transport.lighting, here, transport.reflection, max_depth=max_depth)
-    paths = TermPaths(problem, SPP)
+    here, surfaces = mesh_vertices(scene), transport.reflection
+    paths = TermPaths(Problem(scene, transport.lighting, here, surfaces, max_depth=max_depth), effort.spp)
     every = transport.lighting.n_directions
-    chosen = np.random.default_rng(0).permutation(len(points))[: 2 * ROWS]
-    for some in np.split(chosen, [ROWS]):  # the second half counts
-        start = time.perf_counter()
-        paths.elements(np.repeat(some, every), np.tile(np.arange(every), len(some)))
-        elapsed = time.perf_counter() - start
-    return elapsed / ROWS * len(points)
+    chosen = np.random.default_rng(0).permutation(len(points))[: 2 * effort.rows]
+    for some in np.split(chosen, [effort.rows]):  # the second half counts
+        place = np.repeat(some, every), np.tile(np.arange(every), len(some))
+        elapsed, _ = timed(paths.elements, *place)
+    return elapsed / effort.rows * len(points)
 
 
-def _factors(transport: LightTransport) -> InOutFactors:
+def _surfaces(transport: LightTransport) -> InOutFactors:
     assert isinstance(transport.reflection, InOutFactors)
     return transport.reflection
 
 
 def _factor_errors(scene: Scene, transport: LightTransport) -> list[Report]:
-    found = []
-    for number, factors in enumerate(_factors(transport).factors):
-        vertex = int(np.flatnonzero(_factors(transport).material == number)[0])
+    errors = []
+    for number, factors in enumerate(_surfaces(transport).factors):
+        vertex = int(np.flatnonzero(_surfaces(transport).material == number)[0])
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )
         error = measure_factor_error(factors, material.bsdf, mesh.name)
-        found.append(
-            {
-                "mesh": mesh.name,
-                "bsdf": bsdf_class(material.bsdf),
-                "terms": factors.terms,
-                "whole": error.whole.tolist(),
-                "grazing": error.grazing.tolist(),
-                "peak": error.peak.tolist(),
-            }
+        regions = {name: getattr(error, name).tolist() for name in ("whole", "grazing", "peak")}
+        errors.append(
+            {"mesh": mesh.name, "bsdf": bsdf_class(material.bsdf), "terms": factors.terms} | regions
         )
-    return found
+    return errors

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH, SPP, Reference
-from mi_sparse_prt.benchmark.machine import kept_memory, report_header
-from mi_sparse_prt.benchmark.method_figures import MethodPictures, save_figures
-from mi_sparse_prt.benchmark.relit_errors import RelitReference
+from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH, SPP, Reference, ReferenceEffort
+from mi_sparse_prt.benchmark.measuring import kept_memory, report_header
+from mi_sparse_prt.benchmark.method_figures import MethodPictures, PictureEffort, method_figures
+from mi_sparse_prt.benchmark.relit_reference import RelitEffort, RelitReference
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
+from mi_sparse_prt.validation.validate import save_figures
 
 METHODS = ("sparse", "huang2010", "gather")
 WARM_UP = 4  # texels per edge of a face
@@ -32,6 +34,18 @@ STAGES = {
 RAYS = ("dense rays", "sparse rays", "gather rays", "held out")  # the held-out error is paths
 
 
+@dataclass(frozen=True)
+class ComparisonEffort:
+    """How well a comparison knows the truth, and how it is drawn."""
+
+    reference: ReferenceEffort = field(default_factory=ReferenceEffort)
+    relit: RelitEffort = field(default_factory=RelitEffort)
+    pictures: PictureEffort = field(default_factory=PictureEffort)
+
+
+CONVERGED = ComparisonEffort()
+
+
 @kept_memory()
 def measure_methods(
     scene: Scene,
@@ -39,6 +53,7 @@ def measure_methods(
     methods: list[str],
     progress: bool = True,
     figures: Path | None = None,
+    effort: ComparisonEffort = CONVERGED,
 ) -> dict[str, Any]:
     """Run methods on a scene, direct light and three interreflections, 16 paths per element (``"gather"`` has none).
 
@@ -50,7 +65,8 @@ def measure_methods(
         Of ``precompute``, without brute force.
     progress : bool
     figures : path, optional
-        A folder for a PNG of every figure (see ``figures.method_figures``), made if needed.
+        A folder for a PNG of every figure (see ``method_figures``), made if needed.
+    effort : ComparisonEffort, optional
 
     Returns
     -------
@@ -82,18 +98,18 @@ def measure_methods(
             raise PrtError(
                 f"method {method!r} cannot be compared with brute force; choose {' or '.join(METHODS)}"
             )
-    reference = Reference(scene, lighting, progress)
-    relit = RelitReference(scene, reference.direct, progress)
-    brute_force = reference.time_brute_force()
+    reference = Reference(scene, lighting, progress, effort.reference)
+    relit = RelitReference(scene, reference.direct, progress, effort.relit)
+    brute_force = _brute_force(reference)
     report: dict[str, Any] = {
         **report_header(scene, lighting),
         "parameters": {"max_depth": MAX_DEPTH, "spp": SPP},
-        "brute_force": brute_force | {"errors": reference.brute_force_errors()},
-        "reference_noise": reference.noise(),
+        "brute_force": brute_force,
+        "reference_noise": reference.noise()["meshes"],
         "lighting_noise": relit.noise(),
         "methods": {},
     }
-    pictures = MethodPictures(scene, reference.direct, progress) if figures else None
+    pictures = MethodPictures(scene, reference.direct, progress, effort.pictures) if figures else None
     for method in dict.fromkeys(methods):
         # what is compiled on the first run of an installation is not the method's time
         precompute(scene, CubemapLighting(WARM_UP), method, max_depth=MAX_DEPTH, spp=1, progress=False)
@@ -105,15 +121,37 @@ def measure_methods(
         if pictures:
             pictures.add(method, transport, direct.vertices())
     if figures and pictures:
-        save_figures(figures, report, pictures)
+        save_figures(figures, method_figures(report, pictures))
     return report
+
+
+def _brute_force(reference: Reference) -> dict[str, Any]:
+    """Seconds that all elements would take with as many paths each as the methods have, and their errors."""
+    paths, errors = reference.time_paths(SPP), reference.relative_l2_of_paths(SPP)
+    deviations = errors["standard_error"]["meshes"]
+    return {
+        "direct_seconds": reference.direct_seconds,
+        "paths_seconds": paths.seconds,
+        "paths_seconds_standard_error": paths.standard_error,
+        "seconds": reference.direct_seconds + paths.seconds,
+        "rows": paths.rows,
+        "errors": {
+            name: {
+                "total": value,
+                "direct": 0.0,
+                "indirect": value,
+                "standard_error": dict.fromkeys(("total", "indirect"), deviations[name]),
+            }
+            for name, value in errors["meshes"].items()
+        },
+    }
 
 
 def _cost(transport: LightTransport, brute_force: float) -> dict[str, Any]:
     """Time and elements, the held-out ones included, and where the time went."""
     made = transport.report
     seconds, total = made["seconds"], made["elements_total"]
-    stages = breakdown(seconds)
+    stages = seconds_of_stages(seconds)
     overhead = seconds["total"] - sum(stages[name] for name in RAYS)
     evaluated = made["elements_evaluated"]
     elements = (evaluated + made["estimated_error"]["elements"]) / total
@@ -139,7 +177,7 @@ def _cost(transport: LightTransport, brute_force: float) -> dict[str, Any]:
     }
 
 
-def breakdown(seconds: dict[str, float]) -> dict[str, float]:
+def seconds_of_stages(seconds: dict[str, float]) -> dict[str, float]:
     """Seconds of phases as those of the stages of Figure 12; they add up to ``seconds["total"]``."""
     stages = {stage: sum(seconds.get(phase, 0.0) for phase in phases) for stage, phases in STAGES.items()}
     return stages | {"system": seconds["total"] - sum(stages.values())}

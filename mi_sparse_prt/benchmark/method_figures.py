@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -13,23 +12,22 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mi_sparse_prt.benchmark.relit_errors import environments_of, path_traced
+from mi_sparse_prt.benchmark.relit_reference import environments_of, path_traced
 from mi_sparse_prt.benchmark.vertex_pictures import COLORMAP, vertex_picture
+from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
 from mi_sparse_prt.methods.sparse import DENSE, POWER, RADIUS
 from mi_sparse_prt.operators.visibility import Visibility
-from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
+from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.matrix_figures import tonemapped
+from mi_sparse_prt.validation.matrix_figures import picture_row, tonemapped
+from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices
 
-PIXEL_SAMPLES = 16
-WIDTH = 480  # pixels of a picture of numbers at vertices
-PATHS = 1024  # per vertex, of the fully sampled side of a relit pair
 MAGNIFIED = 10  # differences
 RATES = {
     "dense_vertices": "dense vertices",
@@ -38,6 +36,24 @@ RATES = {
     "elements": "all elements",
 }
 MARKERS = "os^Dv<>p*"
+
+
+@dataclass(frozen=True)
+class PictureEffort:
+    """How well pictures of methods are drawn.
+
+    Attributes
+    ----------
+    pixel_samples : int
+    width : int
+        Pixels of a picture of numbers at vertices.
+    paths : int
+        Per vertex, of the fully sampled side of a relit pair.
+    """
+
+    pixel_samples: int = 16
+    width: int = 480
+    paths: int = 1024
 
 
 class MethodPictures:
@@ -50,6 +66,7 @@ class MethodPictures:
     direct : Visibility
         Exact bits.
     progress : bool
+    effort : PictureEffort
 
     Attributes
     ----------
@@ -63,54 +80,40 @@ class MethodPictures:
         Dense vertices and ranks.
     """
 
-    def __init__(self, scene: Scene, direct: Visibility, progress: bool) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, direct: Visibility, progress: bool, effort: PictureEffort) -> None:
+        self.scene, self.effort = scene, effort
         self.vertex_errors: dict[str, NDArray[np.float64]] = {}
         self.relit: dict[str, NDArray[np.float32]] = {}
         self.full: NDArray[np.float32] | None = None
         self.dense: Dense | None = None
         if not scene.mitsuba.sensors():
             return
-        self._light = _light_of(scene, direct)
-        self.dense = _dense(scene, direct)
+        lighting, own = direct.lighting, scene.mitsuba.environment()
+        sky = own if own is not None else next(iter(environments_of(scene).values()))
+        self._light = light = lighting.project(sky)
+        self.dense = _choose_dense(scene, direct)
         everyone = np.arange(len(scene.positions))
-        light = self._light
-        indirect = path_traced(scene, direct.lighting, light[None], everyone, PATHS, 1, progress)[0]
-        self._irradiance = (direct.relight(light) + indirect).astype(np.float32)
+        indirect = path_traced(scene, lighting, light[None], everyone, effort.paths, 1, progress)[0]
+        irradiance = (direct.relight(light) + indirect).astype(np.float32)
+        self.full = image_of_vertices(
+            scene, irradiance, background_emitter(light, lighting), effort.pixel_samples
+        )
 
     def add(self, method: str, transport: LightTransport, vertex_errors: NDArray[np.float64]) -> None:
         """Take the pictures of a method."""
         if not self.scene.mitsuba.sensors():
             return
         self.vertex_errors[method] = vertex_errors
-        self.relit[method] = render(self.scene, transport, self._light, spp=PIXEL_SAMPLES)
-        if self.full is None:
-            background = background_emitter(self._light, transport.lighting)
-            integrator = RelitIntegrator(RelitScene(self.scene, self._irradiance, background))
-            image = mi.render(self.scene.mitsuba, integrator=integrator, spp=PIXEL_SAMPLES, seed=0)
-            self.full = np.array(image)[..., :3]
+        self.relit[method] = render(self.scene, transport, self._light, spp=self.effort.pixel_samples)
 
 
-def _light_of(scene: Scene, direct: Visibility) -> NDArray[np.float32]:
-    """The scene's own environment, or else the first one to relight with: texels (n_directions, 3)."""
-    own = scene.mitsuba.environment()
-    return direct.lighting.project(own if own is not None else next(iter(environments_of(scene).values())))
-
-
-def _dense(scene: Scene, direct: Visibility) -> Dense:
+def _choose_dense(scene: Scene, direct: Visibility) -> Dense:
     """Dense vertices as ``method="sparse"`` chooses them by rank: a few rays, so they are chosen again."""
     solver = DirectSolver(scene.normalised, direct.lighting, vertex_points(scene))
     sampler = DenseSampler(scene, solver, AngularGrid(direct.lighting), Stopwatch())
     for mesh in scene.meshes:
         sampler.choose(mesh, DENSE, RADIUS, 0, POWER)
     return sampler.dense()
-
-
-def save_figures(folder: Path, report: dict[str, Any], pictures: MethodPictures) -> None:
-    """Write a PNG of every figure into a folder, made if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in method_figures(report, pictures).items():
-        figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
 
 
 def method_figures(report: dict[str, Any], pictures: MethodPictures) -> dict[str, Figure]:
@@ -139,25 +142,22 @@ def method_figures(report: dict[str, Any], pictures: MethodPictures) -> dict[str
     if pictures.dense is None:
         return figures
     scene, dense = pictures.scene, pictures.dense
-    flat = np.full(len(scene.positions), np.nan)
+    width, flat = pictures.effort.width, np.full(len(scene.positions), np.nan)
+    dots = vertex_picture(scene, flat, width=width, dots=dense.ids)
     share = len(dense.ids) / len(flat)
-    figures["dense_vertices"] = _shown(
-        vertex_picture(scene, flat, width=WIDTH, dots=dense.ids), f"dense vertices, {share:.1%} of all"
-    )
+    figures["dense_vertices"] = picture_row({f"dense vertices, {share:.1%} of all": dots})
     title = "local rank: singular values with 99% of the energy"
-    figures["ranks"] = _coloured(scene, dense.ranks.astype(np.float64), title, 1.0)
+    figures["ranks"] = _coloured(scene, dense.ranks.astype(np.float64), title, 1.0, width)
     for method, errors in pictures.vertex_errors.items():
         title = f"{method}: relative L2 of the rows of direct light (%)"
-        figures[f"vertex_error_{method}"] = _coloured(scene, errors, title, 100.0)
-        assert pictures.full is not None
-        figures[f"relit_{method}"] = relit_pair(pictures.full, pictures.relit[method], method)
+        figures[f"vertex_error_{method}"] = _coloured(scene, errors, title, 100.0, width)
+        figures[f"relit_{method}"] = relit_pair(pictures, method)
     return figures
 
 
 def rates(report: dict[str, Any]) -> Figure:
     """Sampling rates per mesh and method, grouped as in Figure 9."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _one_panel(10, 4)
     bars = {
         f"{method}, {mesh}": [100 * values[rate] for rate in RATES]
         for method, found in report["methods"].items()
@@ -170,8 +170,7 @@ def rates(report: dict[str, Any]) -> Figure:
 
 def errors_times(report: dict[str, Any]) -> Figure:
     """Relative L2 of the matrix against time, a point for every method and mesh."""
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _one_panel(10, 4.5)
     brute = report["brute_force"]
     points = {"brute force": (brute["seconds"], brute["errors"])}
     points |= {m: (found["seconds"]["total"], found["errors"]) for m, found in report["methods"].items()}
@@ -195,8 +194,7 @@ def errors_times(report: dict[str, Any]) -> Figure:
 
 def breakdown(report: dict[str, Any]) -> Figure:
     """Time of every stage as a share of the method's own, as in Figure 12."""
-    figure = Figure(figsize=(9, 1.6 + 0.7 * len(report["methods"])), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _one_panel(9, 1.6 + 0.7 * len(report["methods"]))
     done = dict.fromkeys(report["methods"], 0.0)
     for k, stage in enumerate(next(iter(report["methods"].values()))["stages"]):
         for method, found in report["methods"].items():
@@ -214,16 +212,17 @@ def breakdown(report: dict[str, Any]) -> Figure:
 
 def environments(report: dict[str, Any]) -> Figure:
     """Relative L2 of the relit vertices under every environment."""
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    axes = figure.subplots()
-    names: list[str] = []
-    bars = {}
-    for method, found in report["methods"].items():
-        for mesh, errors in found["environments"].items():
-            names = [name for name in errors if name != "mean"]
-            values = [errors[name]["relative_l2"] for name in names]
-            bars[f"{method}, {mesh}"] = [100 * value for value in (*values, errors["mean"])]
-    _grouped(axes, [*names, "mean"], bars, "{:.2f}")
+    figure, axes = _one_panel(12, 4)
+    bars = {
+        f"{method}, {mesh}": {
+            name: 100 * (value if name == "mean" else value["relative_l2"])
+            for name, value in sorted(errors.items(), key=lambda item: item[0] == "mean")
+        }
+        for method, found in report["methods"].items()
+        for mesh, errors in found["environments"].items()
+    }
+    names = list(next(iter(bars.values())))
+    _grouped(axes, names, {label: list(values.values()) for label, values in bars.items()}, "{:.2f}")
     axes.set(ylabel="relative L2 of the relit vertices (%)", title="environments that no method was tuned to")
     return figure
 
@@ -237,9 +236,7 @@ def rotation(report: dict[str, Any]) -> Figure:
         styles = ("-", "--", ":", "-.") * len(turned["meshes"])
         for style, (mesh, values) in zip(styles, turned["meshes"].items(), strict=False):
             # noise above the change makes it 0, which a logarithm cannot show
-            frames = {
-                n: np.where(np.array(v) > 0, 100 * np.array(v), np.nan) for n, v in values["frames"].items()
-            }
+            frames = {n: [100 * v if v > 0 else np.nan for v in vs] for n, vs in values["frames"].items()}
             label = f"{method}, {mesh}"
             left.plot(turned["degrees"], frames["error"], style, color=f"C{k}", label=label)
             right.plot(turned["degrees"], frames["change_of_error"], style, color=f"C{k}", label=label)
@@ -248,36 +245,31 @@ def rotation(report: dict[str, Any]) -> Figure:
                 right.plot(turned["degrees"], light, style, color="grey", label=f"the light itself, {mesh}")
     name = turned["environment"]
     left.set(xlabel="degrees", ylabel="relative L2 of a frame (%)", ylim=(0, None), title=f"{name}, turning")
-    right.set(
-        xlabel="degrees",
-        ylabel="change to the next frame (% of it)",
-        yscale="log",
-        title="change of the error",
-    )
+    right.set(xlabel="degrees", ylabel="change to the next frame (% of it)", yscale="log")
+    right.set_title("change of the error")
     _legend_beside(right)
     return figure
 
 
-def relit_pair(full: NDArray[np.float32], ours: NDArray[np.float32], method: str) -> Figure:
+def relit_pair(pictures: MethodPictures, method: str) -> Figure:
     """Relit with all elements and with a method, and how they differ, as in Figures 1 and 14."""
-    figure = Figure(figsize=(15, 4.2), layout="constrained")
-    scale = np.percentile(full, 99.9)
-    bright = np.clip(full, 0, scale), np.clip(ours, 0, scale)
-    difference = np.clip(0.5 + MAGNIFIED * (ours - full).mean(axis=2) / max(2 * scale, 1e-20), 0, 1)
-    relative = np.linalg.norm(ours - full) / max(float(np.linalg.norm(full)), 1e-20)
-    titles = (
-        f"all elements ({PATHS} indirect paths per vertex)",
-        method,
-        f"difference x {MAGNIFIED}; relative L2 of the image {relative:.2%}",
+    full, ours = pictures.full, pictures.relit[method]
+    assert full is not None
+    top = max(float(np.percentile(full, 99.9)), 1e-20)
+    difference = f"difference x {MAGNIFIED}; relative L2 of the image {relative_l2(ours, full):.2%}"
+    return picture_row(
+        {
+            f"all elements ({pictures.effort.paths} indirect paths per vertex)": tonemapped(full, top),
+            method: tonemapped(ours, top),
+            difference: 0.5 + MAGNIFIED * (ours - full).mean(axis=2) / (2 * top),
+        },
+        "RdBu_r",
     )
-    for axes, image, title in zip(figure.subplots(1, 3), (*bright, difference), titles, strict=True):
-        if image.ndim == 3:
-            axes.imshow(tonemapped(image))
-        else:
-            axes.imshow(image, cmap="RdBu_r", vmin=0, vmax=1)
-        axes.set_title(title)
-        axes.axis("off")
-    return figure
+
+
+def _one_panel(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots()
 
 
 def _grouped(axes: Axes, groups: list[str], bars: dict[str, list[float]], form: str) -> None:
@@ -285,9 +277,9 @@ def _grouped(axes: Axes, groups: list[str], bars: dict[str, list[float]], form: 
     width = 0.8 / len(bars)
     for k, (label, values) in enumerate(bars.items()):
         place = np.arange(len(groups)) + (k + 0.5) * width - 0.4
-        drawn = axes.bar(place, values, width, label=label)
+        labels = [form.format(value) for value in values]
         axes.bar_label(
-            drawn, [form.format(value) for value in values], fontsize="x-small", rotation=90, padding=2
+            axes.bar(place, values, width, label=label), labels, fontsize="x-small", rotation=90, padding=2
         )
     axes.set_xticks(np.arange(len(groups)), groups)
     axes.margins(y=0.15)
@@ -299,18 +291,9 @@ def _legend_beside(axes: Axes) -> None:
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize="small")
 
 
-def _shown(picture: NDArray[np.float32], title: str) -> Figure:
-    figure = Figure(figsize=(7, 5.2), layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(picture)
-    axes.set_title(title)
-    axes.axis("off")
-    return figure
-
-
-def _coloured(scene: Scene, values: NDArray[np.float64], title: str, scale: float) -> Figure:
+def _coloured(scene: Scene, values: NDArray[np.float64], title: str, scale: float, width: int) -> Figure:
     """Numbers at vertices with their colours, the highest hundredth in one colour."""
     top = max(float(np.percentile(values, 99)), 1e-12)
-    figure = _shown(vertex_picture(scene, values, width=WIDTH, vmin=0.0, vmax=top), title)
+    figure = picture_row({title: vertex_picture(scene, values, width=width, vmin=0.0, vmax=top)})
     figure.colorbar(ScalarMappable(Normalize(0, scale * top), COLORMAP), ax=figure.axes[0], shrink=0.7)
     return figure

@@ -10,16 +10,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.exact_rows import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.benchmark.exact_rows import mesh_named, trace_visibility, unit_albedo_rows, values_at
 from mi_sparse_prt.benchmark.least_squares import least_squares_fit
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.metrics import relative_l2_from_squares
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
-from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS
+from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS, RELATIVE_LAMBDA
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
@@ -29,8 +29,6 @@ from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 CURVES = {"least_squares": "least squares", "l1": "L1", "full": "full: least squares on all directions"}
-GRAM_ELEMENTS = 1 << 22  # of the Gram matrices that are solved together: 32 MB
-MOST_TOGETHER = 64  # vertices
 
 
 @dataclass(frozen=True)
@@ -42,12 +40,14 @@ class _Samples:
     positions, dense_positions : (n, 3), (n_dense, 3) float32
         Longest side of the scene = 1.
     exact, dense : (n, n_directions), (n_dense, n_directions) float32
-        White direct transport.
+        Unit-albedo direct transport.
     features : (n_dense, words) uint32 bits
     products : (n_dense, n_dense) float64
         Of dense rows, over all directions: every Gram matrix of a fit to all of them is a part of it.
     projections : (n, n_dense) float64
         Products of exact and dense rows.
+    norms : (n,) float64
+        Squared norms of exact rows.
     """
 
     positions: NDArray[np.float32]
@@ -57,6 +57,13 @@ class _Samples:
     features: Bits
     products: NDArray[np.float64]
     projections: NDArray[np.float64]
+    norms: NDArray[np.float64]
+
+    def neighbours(self, vertex: int, radius: float) -> NDArray[np.int32]:
+        """Dense vertices (k,) within the radius, nearest first."""
+        distance = np.linalg.norm(self.dense_positions - self.positions[vertex], axis=1)
+        near = np.flatnonzero(distance <= radius)
+        return near[np.argsort(distance[near], kind="stable")].astype(np.int32)
 
 
 def error_against_radius(
@@ -66,8 +73,6 @@ def error_against_radius(
     radii: list[float],
     n_vertices: int = 400,
     directions: int = 350,
-    relative_lambda: float = 1e-2,
-    seed: int = 0,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Error of reconstructed rows against the radius within which dense vertices are neighbours ([HR10] Figure 6).
@@ -87,9 +92,6 @@ def error_against_radius(
         Size of the sample; all sparse vertices if there are fewer.
     directions : int
         Feature directions per vertex, at most: a small radius has fewer ([HR10] 5.3).
-    relative_lambda : float
-        Of the L1 fit; see ``l1_fit``.
-    seed : int
     progress : bool
         Show a bar.
 
@@ -113,33 +115,32 @@ def error_against_radius(
     float32 that regularises so much that least squares does not overfit, and that ``full`` gets worse with the
     radius. The products of all dense rows are kept: O(n_dense^2) memory.
     """
-    _check(radii, n_vertices, directions)
-    mesh = mesh_named(scene, mesh_name)
-    samples = _sampled(scene, lighting, mesh, n_vertices, seed)
-    report: dict[str, Any] = {
+    if not len(radii) or not all(np.isfinite(r) and r > 0 for r in radii):
+        raise PrtError(f"radii are {list(radii)}: give positive numbers, in longest sides of the scene")
+    for name, value in (("n_vertices", n_vertices), ("directions", directions)):
+        if value < 1:
+            raise PrtError(f"{name} is {value}: give 1 or more")
+    samples = _draw_samples(scene, lighting, mesh_named(scene, mesh_name), n_vertices)
+    found = [
+        _at_radius(samples, radius, directions) for radius in tqdm(radii, desc="radii", disable=not progress)
+    ]
+    curves = {
+        quantity: {curve: [at[quantity][k] for at in found] for k, curve in enumerate(CURVES)}
+        for quantity in ("error", "weights")
+    }
+    means = ("neighbours", "without_neighbours", "directions")
+    return {
         "scene": scene.path,
-        "mesh": mesh.name,
+        "mesh": mesh_name,
         "resolution": lighting.resolution,
         "vertices": len(samples.exact),
         "dense_vertices": len(samples.dense),
         "directions_asked": directions,
-        "relative_lambda": relative_lambda,
-        "seed": seed,
+        "relative_lambda": RELATIVE_LAMBDA,
         "radii": [float(radius) for radius in radii],
-        "neighbours": [],
-        "without_neighbours": [],
-        "directions": [],
-        "error": {curve: [] for curve in CURVES},
-        "weights": {curve: [] for curve in CURVES},
+        **{name: [at[name] for at in found] for name in means},
+        **curves,
     }
-    for radius in tqdm(radii, desc="radii", disable=not progress):
-        means, error, weights = _at_radius(samples, radius, directions, relative_lambda)
-        for name, value in means.items():
-            report[name].append(value)
-        for k, curve in enumerate(CURVES):
-            report["error"][curve].append(float(error[k]))
-            report["weights"][curve].append(float(weights[k]))
-    return report
 
 
 def plot_error_against_radius(report: dict[str, Any]) -> Figure:
@@ -152,45 +153,29 @@ def plot_error_against_radius(report: dict[str, Any]) -> Figure:
     right.plot(report["radii"], report["neighbours"], "k:", label="neighbours")
     right.plot(report["radii"], report["directions"], "--", color="grey", label="sampled directions")
     top = 1.4 * 100 * max(max(errors) for errors in report["error"].values())  # room for the legend
-    left.set(
-        xlabel="radius / longest side of the scene",
-        ylabel="relative L2 of the rows (%)",
-        ylim=(0, top),
-        title=f"{report['mesh']}: error",
-    )
-    right.set(
-        xlabel="radius / longest side of the scene",
-        ylabel="mean per vertex",
-        yscale="symlog",
-        title=f"{report['mesh']}: size of the systems",
-    )
+    left.set(ylabel="relative L2 of the rows (%)", ylim=(0, top), title=f"{report['mesh']}: error")
+    right.set(ylabel="mean per vertex", yscale="symlog", title=f"{report['mesh']}: size of the systems")
+    for axes in (left, right):
+        axes.set_xlabel("radius / longest side of the scene")
     left.legend(loc="upper right")
     right.legend(fontsize="small")
     return figure
 
 
-def _check(radii: list[float], n_vertices: int, directions: int) -> None:
-    if not len(radii) or not all(np.isfinite(r) and r > 0 for r in radii):
-        raise PrtError(f"radii are {list(radii)}: give positive numbers, in longest sides of the scene")
-    for name, value in (("n_vertices", n_vertices), ("directions", directions)):
-        if value < 1:
-            raise PrtError(f"{name} is {value}: give 1 or more")
-
-
-def _sampled(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: int, seed: int) -> _Samples:
+def _draw_samples(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: int) -> _Samples:
     """Dense rows as phase 1 of ``huang2010`` finds them, and exact rows of some other vertices."""
     points = vertex_points(scene)
     direct = DirectSolver(scene.normalised, lighting, points)
     sampler = DenseSampler(scene, direct, AngularGrid(lighting), Stopwatch())
-    sampler.choose(mesh, DENSE_GROUND, RADIUS, seed)
+    sampler.choose(mesh, DENSE_GROUND, RADIUS, seed=0)
     dense = sampler.dense()
     others = np.setdiff1d(np.arange(mesh.vertices.start, mesh.vertices.stop), dense.ids)
     if not len(others):
         raise PrtError(f"all vertices of the mesh {mesh.name!r} are dense: it is too small for this")
-    sparse = others[choose_weighted(np.ones(len(others)), points.keys[others], n_vertices, seed)]
-    exact = white_rows(traced_rows(direct, sparse), scene.normals[sparse], lighting)
-    rows = white_rows(dense.rows.visible, scene.normals[dense.ids], lighting)
-    precise = rows.astype(np.float64)
+    sparse = others[choose_weighted(np.ones(len(others)), points.keys[others], n_vertices, 0)]
+    exact = unit_albedo_rows(trace_visibility(direct, sparse), scene.normals[sparse], lighting)
+    rows = unit_albedo_rows(dense.rows.visible, scene.normals[dense.ids], lighting)
+    precise, true = rows.astype(np.float64), exact.astype(np.float64)
     return _Samples(
         scene.normalised_positions[sparse],
         exact,
@@ -198,85 +183,44 @@ def _sampled(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: in
         rows,
         dense.rows.features,
         precise @ precise.T,
-        exact.astype(np.float64) @ precise.T,
+        true @ precise.T,
+        (true**2).sum(axis=1),
     )
 
 
-def _at_radius(
-    samples: _Samples, radius: float, count: int, relative_lambda: float
-) -> tuple[dict[str, float], NDArray[np.float64], NDArray[np.float64]]:
-    """Means per vertex, and for each curve the relative L2 error and the mean number of weights."""
-    near = _neighbours(samples, radius)
-    known = (near >= 0).sum(axis=1)
-    squared, used, directions = np.zeros(len(CURVES)), np.zeros(len(CURVES)), 0
-    for ids in _blocks(known):
-        some = near[ids, : max(1, known[ids].max())]
-        chosen = choose_features(some, samples.dense, samples.features, count)
-        directions += int((chosen >= 0).sum())
-        weights = _fits(samples, ids, some, chosen, relative_lambda)
-        used += (weights != 0).sum(axis=(0, 2))
-        for k, vertex in enumerate(ids):
-            present = some[k] >= 0
-            rows = weights[k][:, present] @ samples.dense[some[k][present]]  # [curve, direction]
-            squared += ((rows - samples.exact[vertex]) ** 2).sum(axis=1)
-    n = len(known)
-    means = {
-        "neighbours": float(known.mean()),
-        "without_neighbours": float((known == 0).mean()),
+def _at_radius(samples: _Samples, radius: float, count: int) -> dict[str, Any]:
+    """Means per vertex; ``error`` (relative L2) and ``weights`` (mean number) are lists, a number for each curve."""
+    n = len(samples.exact)
+    squares, used = np.zeros(len(CURVES)), np.zeros(len(CURVES))
+    neighbours, alone, directions = 0, 0, 0
+    for vertex in range(n):
+        near = samples.neighbours(vertex, radius)
+        if not len(near):
+            squares += samples.norms[vertex]
+            alone += 1
+            continue
+        weights, sampled = _fit_weights(samples, vertex, near, count)
+        neighbours += len(near)
+        directions += sampled
+        used += (weights != 0).sum(axis=1)
+        squares += ((weights @ samples.dense[near] - samples.exact[vertex]) ** 2).sum(axis=1)
+    return {
+        "neighbours": neighbours / n,
+        "without_neighbours": alone / n,
         "directions": directions / n,
+        "error": relative_l2_from_squares(squares, samples.norms.sum()).tolist(),
+        "weights": (used / n).tolist(),
     }
-    return (
-        means,
-        np.sqrt(squared / max(float((samples.exact.astype(np.float64) ** 2).sum()), 1e-30)),
-        used / n,
-    )
 
 
-def _neighbours(samples: _Samples, radius: float) -> NDArray[np.int32]:
-    """All dense vertices (n, k) in the radius, nearest first, -1 where there are fewer."""
-    parts = []
-    for a in range(0, len(samples.positions), MOST_TOGETHER):
-        p = samples.positions[a : a + MOST_TOGETHER]
-        ids = radius_neighbours(p, samples.dense_positions, radius, len(samples.dense)).ids
-        parts.append(ids[:, : max(1, int((ids >= 0).sum(axis=1).max()))])
-    widest = max(part.shape[1] for part in parts)
-    return np.concatenate(
-        [np.pad(part, ((0, 0), (0, widest - part.shape[1])), constant_values=-1) for part in parts]
-    )
-
-
-def _blocks(known: NDArray[np.integer]) -> list[NDArray[np.int64]]:
-    """Vertices in blocks of about as many neighbours, each with Gram matrices of bounded size."""
-    order, blocks = np.argsort(-known, kind="stable"), []
-    while len(order):
-        size = int(np.clip(GRAM_ELEMENTS // max(1, int(known[order[0]])) ** 2, 1, MOST_TOGETHER))
-        blocks.append(order[:size])
-        order = order[size:]
-    return blocks
-
-
-def _fits(
-    samples: _Samples,
-    ids: NDArray[np.int64],
-    near: NDArray[np.int32],
-    chosen: NDArray[np.int32],
-    relative_lambda: float,
-) -> NDArray[np.float64]:
-    """Weights (n, curve, k) of neighbours (n, k), in the order of ``CURVES``."""
-    exact = samples.exact[ids]
-    sampled = np.where(chosen >= 0, np.take_along_axis(exact, np.maximum(chosen, 0), axis=1), np.float32(0))
-    few = normal_equations(samples.dense, near, chosen, sampled)
-    full = _all_directions(samples, ids, near)
-    fits = (least_squares_fit(*few), l1_fit(*few, relative_lambda), least_squares_fit(*full))
-    return np.stack([fit.weights for fit in fits], axis=1)
-
-
-def _all_directions(
-    samples: _Samples, ids: NDArray[np.int64], near: NDArray[np.int32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """As ``normal_equations`` of vertices ``ids`` (n,) and neighbours (n, k), with all directions."""
-    present, columns = near >= 0, np.maximum(near, 0)
-    gram = samples.products[columns[:, :, None], columns[:, None, :]]
-    gram *= present[:, :, None] & present[:, None, :]
-    correlation = np.take_along_axis(samples.projections[ids], columns, axis=1) * present
-    return gram, correlation, (samples.exact[ids].astype(np.float64) ** 2).sum(axis=1)
+def _fit_weights(
+    samples: _Samples, vertex: int, near: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], int]:
+    """Weights (curve, k) of neighbours (k,), in the order of ``CURVES``, and how many directions two of them saw."""
+    chosen = choose_features(near[None], samples.dense, samples.features, count)
+    values = values_at(samples.exact[vertex][None], chosen)
+    few = normal_equations(samples.dense, near[None], chosen, values)
+    gram = samples.products[np.ix_(near, near)]
+    full = gram[None], samples.projections[vertex, near][None], samples.norms[[vertex]]
+    fits = least_squares_fit(*few), l1_fit(*few, RELATIVE_LAMBDA), least_squares_fit(*full)
+    return np.concatenate([fit.weights for fit in fits]), int((chosen >= 0).sum())

@@ -6,7 +6,7 @@ import warnings
 from typing import Any
 
 from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
-from mi_sparse_prt.benchmark.machine import kept_memory, report_header
+from mi_sparse_prt.benchmark.measuring import kept_memory, report_header
 from mi_sparse_prt.core.errors import PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.methods.plan import Plan
@@ -62,7 +62,7 @@ def measure_plans(
     plans.sort(key=lambda p: p["seconds"])
     return {
         **report_header(scene, lighting),
-        "targets": [_judged(target, auto, plans) for target, auto in zip(targets, made, strict=True)],
+        "targets": [_against_best(target, auto, plans) for target, auto in zip(targets, made, strict=True)],
         "plans": plans,
         "left_out": len(found) - len(plans),
     }
@@ -98,7 +98,7 @@ def _carried_out(
 
 
 def _fixed(auto: Report) -> float:
-    """Seconds that ``"auto"`` takes for one attempt, whatever the plan: the last judge is the report's."""
+    """Seconds that ``"auto"`` takes for one attempt, whatever the plan: the last estimate is the report's."""
     seconds = {name: auto["seconds"].get(name, 0.0) for name in FIXED}
     seconds["held_out"] *= 2 / (_attempts(auto) + 1)
     return sum(seconds.values())
@@ -108,7 +108,7 @@ def _attempts(auto: Report) -> int:
     return sum(p["chosen"] for p in auto["plans"])
 
 
-def _judged(target: float, auto: Report, plans: list[Report]) -> Report:
+def _against_best(target: float, auto: Report, plans: list[Report]) -> Report:
     """What ``"auto"`` made of a target, against the best of the plans."""
     error = auto["estimated_error"]
     total, deviation = error["total"], error["standard_error"]["total"]

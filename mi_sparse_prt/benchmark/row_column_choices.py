@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mi_sparse_prt.benchmark.comparators import compare_choices, plot_choices
-from mi_sparse_prt.benchmark.machine import report_header
+from mi_sparse_prt.benchmark.column_choice_errors import compare_choices, plot_choices
+from mi_sparse_prt.benchmark.measuring import report_header
 from mi_sparse_prt.benchmark.neighbour_radius import error_against_radius, plot_error_against_radius
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.validation.validate import save_figures
 
 RADII = [0.025, 0.0375, 0.05, 0.075, 0.1, 0.125, 0.15]  # in longest sides of the scene
 VERTICES = 1000  # of a mesh, at which choices are compared
@@ -38,11 +39,7 @@ def measure_choices(
         (``error_against_radius``); ``skipped`` says which meshes are not among them, and why. JSON as it is.
     """
     directions = max(1, round(DIRECTIONS * lighting.n_directions))
-    report: dict[str, Any] = {
-        **report_header(scene, lighting),
-        "meshes": {},
-        "skipped": [],
-    }
+    report: dict[str, Any] = {**report_header(scene, lighting), "meshes": {}, "skipped": []}
     for mesh in scene.meshes:
         try:
             found = {
@@ -56,12 +53,6 @@ def measure_choices(
             continue
         report["meshes"][mesh.name] = found
         if figures is not None:
-            _draw(found, mesh.name, figures)
+            choices, radius = plot_choices(found["choices"]), plot_error_against_radius(found["radius"])
+            save_figures(figures, {f"choices_{mesh.name}": choices, f"radius_{mesh.name}": radius})
     return report
-
-
-def _draw(found: dict[str, Any], mesh: str, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    plots = {"choices": plot_choices(found["choices"]), "radius": plot_error_against_radius(found["radius"])}
-    for name, plot in plots.items():
-        plot.savefig(folder / f"{name}_{mesh}.png", dpi=110, bbox_inches="tight")

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mi_sparse_prt.benchmark.brute_force_time import RowsTime
-from mi_sparse_prt.benchmark.column_methods import CHOICES, precompute_with_columns
-from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH, SPP, Reference
+from mi_sparse_prt.benchmark.brute_force import BruteForce, RowsTime
+from mi_sparse_prt.benchmark.column_sampling import precompute_with_columns
+from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH, SPP, Reference, ReferenceEffort
 from mi_sparse_prt.benchmark.direct_speed import measure_direct
-from mi_sparse_prt.benchmark.equal_error import BruteForce
-from mi_sparse_prt.benchmark.machine import kept_memory, report_header
-from mi_sparse_prt.benchmark.time_error_figure import save_figures
+from mi_sparse_prt.benchmark.measuring import kept_memory, report_header
+from mi_sparse_prt.benchmark.time_error_figure import time_error_figures
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
+from mi_sparse_prt.validation.validate import save_figures
 
-SPPS = (1, 4, 16, 64)  # of brute force
-ADJOINT_SPPS = (2, 8, 32)
-TARGETS = (0.05, 0.02, 0.01, 0.005)  # of method="auto"
 RAY_REPEATS = 3
 WARM_UP = 4  # texels per edge of a face
 
@@ -37,7 +35,32 @@ LABELS = {
     "consensus_gather": "consensus + finite elements",
 }
 
-Run = Callable[[Scene, CubemapLighting, int, bool], LightTransport]  # the integer is spp
+Run = Callable[..., LightTransport]  # of a scene and a lighting, with max_depth, spp and progress by name
+
+
+@dataclass(frozen=True)
+class TimeErrorEffort:
+    """Which points a plot of time against error has, and how well the truth is known.
+
+    Attributes
+    ----------
+    spp : int
+        Paths per element of methods that trace them.
+    brute_force_spps, adjoint_spps : tuple of int
+        Of brute force and of rows by the adjoint solver, ascending.
+    targets : tuple of float
+        Relative L2 errors asked of ``method="auto"``.
+    reference : ReferenceEffort
+    """
+
+    spp: int = SPP
+    brute_force_spps: tuple[int, ...] = (1, 4, 16, 64)
+    adjoint_spps: tuple[int, ...] = (2, 8, 32)
+    targets: tuple[float, ...] = (0.05, 0.02, 0.01, 0.005)
+    reference: ReferenceEffort = field(default_factory=ReferenceEffort)
+
+
+FULL = TimeErrorEffort()
 
 
 @kept_memory()
@@ -48,6 +71,7 @@ def time_against_error(
     figures: Path | None = None,
     only: Sequence[str] | None = None,
     reference_spp: int | None = None,
+    effort: TimeErrorEffort = FULL,
 ) -> dict[str, Any]:
     """Run every method on a scene: direct light and three interreflections.
 
@@ -62,7 +86,8 @@ def time_against_error(
     only : sequence of str, optional
         Names of ``methods()`` to run, beside brute force and the adjoint solver; all if not given.
     reference_spp : int, optional
-        Paths per element of each of the reference's two halves, 6144 if not given.
+        Paths per element of each of the reference's two halves, those of ``effort`` (6144) if not given.
+    effort : TimeErrorEffort, optional
 
     Returns
     -------
@@ -89,100 +114,90 @@ def time_against_error(
     PrtError
         If there is no method of a name in ``only``.
     """
-    runs = _chosen(only)
-    reference = Reference(scene, lighting, progress, reference_spp)
+    runs, known = _select(methods(effort.targets), only), effort.reference
+    if reference_spp is not None:
+        known = replace(known, element_spp=reference_spp)
+    reference = Reference(scene, lighting, progress, known)
     rays, _ = measure_direct(scene, lighting, RAY_REPEATS)
-    brute = [_all_paths(reference, spp, rays["seconds"]) for spp in SPPS]
-    adjoint = [_all_rows(reference, spp, rays["seconds"]) for spp in ADJOINT_SPPS]
-    curve = _curve(brute, rays["seconds"])
+    direct_seconds = rays["seconds"]
+    brute = [
+        _point(spp, reference.time_paths(spp), direct_seconds, reference.relative_l2_of_paths(spp))
+        for spp in effort.brute_force_spps
+    ]
+    adjoint = [
+        _point(spp, reference.time_adjoint(spp), direct_seconds, reference.relative_l2_of_adjoint(spp))
+        for spp in effort.adjoint_spps
+    ]
+    curve = _curve(brute, direct_seconds)
     report: dict[str, Any] = {
         **report_header(scene, lighting),
-        "parameters": {"max_depth": MAX_DEPTH, "spp": SPP},
+        "parameters": {"max_depth": MAX_DEPTH, "spp": effort.spp},
         "bare_rays": {
             "rays": rays["rays"],
             "seconds": rays["bare_seconds"],
-            "direct_seconds": rays["seconds"],
+            "direct_seconds": direct_seconds,
         },
-        "reference_noise": {"total": reference.total_noise(), "meshes": reference.noise()},
+        "reference_noise": {
+            name: value for name, value in reference.noise().items() if name != "standard_error"
+        },
         "brute_force": brute,
         "noise_of_one_path": curve.noise,
         "adjoint": adjoint,
         "methods": {},
         "skipped": [],
     }
-    for name, run in runs.items():
-        try:
-            transport = _after_warm_up(name, run, scene, lighting, progress)
-        except PrtError as error:  # not for this scene: the others can still be compared
-            report["skipped"].append(f"{name}: {error}")
-            continue
-        report["methods"][name] = _found(name, transport, reference, curve, rays["bare_seconds"])
+    for name, outcome in run_methods(runs, scene, lighting, effort.spp, progress):
+        if isinstance(outcome, PrtError):
+            report["skipped"].append(f"{name}: {outcome}")
+        else:
+            report["methods"][name] = _measure(name, outcome, reference, curve, rays["bare_seconds"])
     if figures is not None:
-        save_figures(figures, report)
+        save_figures(figures, time_error_figures(report))
     return report
 
 
-def methods() -> dict[str, Run]:
+def methods(targets: Sequence[float] = FULL.targets) -> dict[str, Run]:
     """What is run, by name: everything but brute force and the adjoint solver, which are timed in parts."""
     return {
-        "huang2010": partial(_by_name, "huang2010"),
-        **{choice: partial(_by_columns, choice) for choice in CHOICES},
-        "sparse": partial(_by_name, "sparse"),
-        "gather": partial(_by_name, "gather"),
-        "consensus_gather": partial(_by_name, Plan("consensus", "gather")),
-        **{f"auto {target:g}": partial(_by_target, target) for target in TARGETS},
+        "huang2010": partial(precompute, method="huang2010"),
+        "clustered_columns": partial(precompute_with_columns, choice="clustered_columns"),
+        "k_means_columns": partial(precompute_with_columns, choice="k_means_columns"),
+        "sparse": partial(precompute, method="sparse"),
+        "gather": partial(precompute, method="gather"),
+        "consensus_gather": partial(precompute, method=Plan("consensus", "gather")),
+        **{f"auto {target:g}": partial(precompute, target_error=target) for target in targets},
     }
 
 
-def _by_name(
-    method: str | Plan, scene: Scene, lighting: CubemapLighting, spp: int, progress: bool
-) -> LightTransport:
-    return precompute(scene, lighting, method, max_depth=MAX_DEPTH, spp=spp, progress=progress)
-
-
-def _by_columns(
-    choice: str, scene: Scene, lighting: CubemapLighting, spp: int, progress: bool
-) -> LightTransport:
-    return precompute_with_columns(scene, lighting, choice, MAX_DEPTH, spp, progress=progress)
-
-
-def _by_target(
-    target: float, scene: Scene, lighting: CubemapLighting, spp: int, progress: bool
-) -> LightTransport:
-    """How many paths an element gets is for the planner to say."""
-    return precompute(scene, lighting, "auto", max_depth=MAX_DEPTH, target_error=target, progress=progress)
-
-
-def _chosen(only: Sequence[str] | None) -> dict[str, Run]:
-    known = methods()
+def _select(known: dict[str, Run], only: Sequence[str] | None) -> dict[str, Run]:
     unknown = [name for name in only or () if name not in known]
     if unknown:
         raise PrtError(f"no method {unknown[0]!r} to time: choose from {', '.join(known)}")
     return known if only is None else {name: known[name] for name in only}
 
 
-def _after_warm_up(
-    name: str, run: Run, scene: Scene, lighting: CubemapLighting, progress: bool
-) -> LightTransport:
-    """The matrix of a method that was run before: what an installation compiles once is not the method's time.
+def run_methods(
+    runs: Mapping[str, Run], scene: Scene, lighting: CubemapLighting, spp: int, progress: bool
+) -> Iterator[tuple[str, LightTransport | PrtError]]:
+    """The matrix of each method, or why it refuses this scene: the others can still be compared.
 
-    ``"auto"`` is made of the others, and may work hard for a target at any resolution.
+    Each is run before: what an installation compiles once is not the method's time. ``"auto"`` is made of the others,
+    and may work hard for a target at any resolution.
     """
-    with warnings.catch_warnings():  # targets that are missed: the report tells by how much
-        warnings.simplefilter("ignore", PrtWarning)
-        if not name.startswith("auto"):
-            run(scene, CubemapLighting(min(WARM_UP, lighting.resolution)), 1, False)
-        return run(scene, lighting, SPP, progress)
-
-
-def _all_paths(reference: Reference, spp: int, direct_seconds: float) -> dict[str, Any]:
-    """Brute force with so many paths per element."""
-    return _point(spp, reference.time_paths(spp), direct_seconds, reference.relative_l2_of_paths(spp))
-
-
-def _all_rows(reference: Reference, spp: int, direct_seconds: float) -> dict[str, Any]:
-    """All rows by the adjoint solver, with so many samples of each."""
-    return _point(spp, reference.time_adjoint(spp), direct_seconds, reference.relative_l2_of_adjoint(spp))
+    for name, run in runs.items():
+        try:
+            with warnings.catch_warnings():  # targets that are missed: the report tells by how much
+                warnings.simplefilter("ignore", PrtWarning)
+                if name.startswith("auto"):  # how many paths an element gets is for the planner to say
+                    transport = run(scene, lighting, max_depth=MAX_DEPTH, progress=progress)
+                else:
+                    coarse = CubemapLighting(min(WARM_UP, lighting.resolution))
+                    run(scene, coarse, max_depth=MAX_DEPTH, spp=1, progress=False)
+                    transport = run(scene, lighting, max_depth=MAX_DEPTH, spp=spp, progress=progress)
+        except PrtError as error:
+            yield name, error
+        else:
+            yield name, transport
 
 
 def _point(spp: int, rows: RowsTime, direct_seconds: float, error: dict[str, Any]) -> dict[str, Any]:
@@ -204,7 +219,7 @@ def _curve(points: list[dict[str, Any]], direct_seconds: float) -> BruteForce:
     )
 
 
-def _found(
+def _measure(
     name: str, transport: LightTransport, reference: Reference, curve: BruteForce, bare_seconds: float
 ) -> dict[str, Any]:
     """Cost and errors of a method's matrix."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,14 +17,29 @@ DEVIATIONS = 2  # standard errors that bars show
 FARTHER = 1.5  # lines go on until they are this factor below the best method
 
 
-def save_figures(folder: Path, report: dict[str, Any]) -> None:
-    """Write ``time_against_error.png``, and one for each mesh where there are several."""
-    folder.mkdir(parents=True, exist_ok=True)
+Shown = list[Artist | ErrorbarContainer]  # what the legend names
+
+
+class _Solver(NamedTuple):
+    """How a solver is drawn whose error is noise: its entry of the report, colour, label, and what it has more of."""
+
+    key: str
+    colour: str
+    label: str
+    effort: str
+
+
+SOLVERS = (
+    _Solver("brute_force", "black", "brute force", "paths"),
+    _Solver("adjoint", "0.5", "adjoint rows", "samples"),
+)
+
+
+def time_error_figures(report: dict[str, Any]) -> dict[str, Figure]:
+    """``time_against_error``, and one for each mesh where there are several."""
     meshes = list(report["reference_noise"]["meshes"])
-    for mesh in (None, *(meshes if len(meshes) > 1 else ())):
-        name = "time_against_error" + (f"_{mesh}" if mesh else "")
-        figure = time_error_figure(report, mesh)
-        figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+    each = {f"time_against_error_{mesh}": time_error_figure(report, mesh) for mesh in meshes}
+    return {"time_against_error": time_error_figure(report)} | (each if len(meshes) > 1 else {})
 
 
 def time_error_figure(report: dict[str, Any], mesh: str | None = None) -> Figure:
@@ -49,22 +64,15 @@ def time_error_figure(report: dict[str, Any], mesh: str | None = None) -> Figure
     methods, noise, bare = report["methods"], report["reference_noise"], report["bare_rays"]
     errors = [_error(point, mesh)[0] for point in methods.values()]
     least = min((error for error in errors if error > 0), default=np.inf) / FARTHER
-    shown = [
-        *_noisy(
-            axes, report["brute_force"], mesh, bare["direct_seconds"], least, "black", "brute force", "paths"
-        ),
-        *_noisy(
-            axes, report["adjoint"], mesh, bare["direct_seconds"], least, "0.5", "adjoint rows", "samples"
-        ),
+    shown: Shown = []
+    for solver in SOLVERS:
+        shown += _noisy(axes, solver, report, mesh, least)
+    rays = f"bare occlusion rays of the matrix: {bare['seconds']:.3g} s"
+    shown += [
         *_methods(axes, methods, mesh),
         *_targets(axes, methods, mesh),
         *_floor(axes, noise["total"] if mesh is None else noise["meshes"][mesh]),
-        axes.axvline(
-            bare["seconds"],
-            color="tab:cyan",
-            linestyle=":",
-            label=f"bare occlusion rays of the matrix: {bare['seconds']:.3g} s",
-        ),
+        axes.axvline(bare["seconds"], color="tab:cyan", linestyle=":", label=rays),
     ]
     size = report["scene"]
     axes.set(
@@ -94,67 +102,46 @@ def _error(point: dict[str, Any], mesh: str | None) -> tuple[float, float]:
     return found["meshes"][mesh], found["standard_error"]["meshes"][mesh]
 
 
-def _noisy(
-    axes: Axes,
-    points: list[dict[str, Any]],
-    mesh: str | None,
-    direct_seconds: float,
-    least: float,
-    colour: str,
-    label: str,
-    effort: str,
-) -> list[Artist | ErrorbarContainer]:
+def _noisy(axes: Axes, solver: _Solver, report: dict[str, Any], mesh: str | None, least: float) -> Shown:
     """The line of a solver whose error is noise: as far as it was measured, and beyond until ``least``."""
+    points, direct_seconds = report[solver.key], report["bare_rays"]["direct_seconds"]
     seconds = np.array([point["seconds"] for point in points])
     errors, deviations = np.array([_error(point, mesh) for point in points]).T
     efforts = ", ".join(str(point["spp"]) for point in points)
-    shown: list[Artist | ErrorbarContainer] = [
-        axes.errorbar(
-            seconds,
-            100 * errors,
-            100 * DEVIATIONS * deviations,
-            fmt="o-",
-            color=colour,
-            capsize=3,
-            label=f"{label}, {efforts} {effort} per element",
-        )
-    ]
+    style: dict[str, Any] = {"fmt": "o-", "color": solver.colour, "capsize": 3}
+    label = f"{solver.label}, {efforts} {solver.effort} per element"
+    shown: Shown = [axes.errorbar(seconds, 100 * errors, 100 * DEVIATIONS * deviations, **style, label=label)]
     if errors[-1] > least:
         factor = np.geomspace(1, (errors[-1] / least) ** 2, 50)
-        shown += axes.plot(
-            direct_seconds + (seconds[-1] - direct_seconds) * factor,
-            100 * errors[-1] / np.sqrt(factor),
-            "--",
-            color=colour,
-            label=f"  extrapolated as 1 / sqrt({effort})",
-        )
+        beyond = direct_seconds + (seconds[-1] - direct_seconds) * factor, 100 * errors[-1] / np.sqrt(factor)
+        label = f"  extrapolated as 1 / sqrt({solver.effort})"
+        shown += axes.plot(*beyond, "--", color=solver.colour, label=label)
     return shown
 
 
-def _methods(axes: Axes, methods: dict[str, Any], mesh: str | None) -> list[ErrorbarContainer]:
+def _methods(axes: Axes, methods: dict[str, Any], mesh: str | None) -> Shown:
     """A point for every method that has no target."""
-    shown = []
+    shown: Shown = []
     for k, point in enumerate(p for p in methods.values() if "target_error" not in p):
         marker, colour = MARKERS[k % len(MARKERS)], COLOURS[k % len(COLOURS)]
         shown += _point(axes, point, mesh, point["label"], marker, colour)
     return shown
 
 
-def _targets(axes: Axes, methods: dict[str, Any], mesh: str | None) -> list[ErrorbarContainer]:
+def _targets(axes: Axes, methods: dict[str, Any], mesh: str | None) -> Shown:
     """The line of ``"auto"``, a star for every target."""
     points = [point for point in methods.values() if "target_error" in point]
     seconds = [point["without_held_out"]["seconds"] for point in points]
     axes.plot(seconds, [100 * _error(point, mesh)[0] for point in points], color="tab:red", linewidth=1)
-    shown = []
+    shown: Shown = []
     for point in points:
-        label = f"auto, target {point['target_error']:.1%}"
-        shown += _point(axes, point, mesh, label, "*", "tab:red")
+        shown += _point(axes, point, mesh, f"auto, target {point['target_error']:.1%}", "*", "tab:red")
     return shown
 
 
 def _point(
     axes: Axes, point: dict[str, Any], mesh: str | None, label: str, marker: str, colour: str
-) -> list[ErrorbarContainer]:
+) -> Shown:
     """A method's time and error, and its ratios in the legend; nothing if a logarithm cannot show the error."""
     error, deviation = _error(point, mesh)
     if error <= 0:  # too small for the reference to tell
@@ -165,21 +152,11 @@ def _point(
         text += f", {own['speed_up']:.3g} x the speed of brute force"
     spread = [[100 * min(DEVIATIONS * deviation, 0.9 * error)], [100 * DEVIATIONS * deviation]]
     axes.plot([own["seconds"], point["seconds"]], 2 * [100 * error], color=colour, linewidth=0.8)
-    return [
-        axes.errorbar(
-            own["seconds"],
-            100 * error,
-            spread,
-            fmt=marker,
-            color=colour,
-            markersize=8,
-            capsize=3,
-            label=text,
-        )
-    ]
+    style: dict[str, Any] = {"fmt": marker, "color": colour, "markersize": 8, "capsize": 3}
+    return [axes.errorbar(own["seconds"], 100 * error, spread, **style, label=text)]
 
 
-def _floor(axes: Axes, noise: float) -> list[Artist]:
+def _floor(axes: Axes, noise: float) -> Shown:
     """Where the reference's own noise is as large as what is measured: its mean is taken out, its spread is not."""
     bottom, top = axes.get_ylim()
     if noise <= 0:

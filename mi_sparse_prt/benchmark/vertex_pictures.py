@@ -99,23 +99,20 @@ class _Hits:
     def __init__(self, scene: Scene, ray: mi.RayDifferential3f, film_pixels: float) -> None:
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
         # one mesh of all triangles: the number of a primitive is that of the triangle
-        hit = _one_mesh(scene.positions, triangles).ray_intersect_preliminary(mi.Ray3f(ray))
+        surface = _one_mesh(scene.positions, triangles)  # has to outlive what it is asked
+        hit = surface.ray_intersect_preliminary(mi.Ray3f(ray))
+        si = hit.compute_surface_interaction(mi.Ray3f(ray))
         self.valid = hit.is_valid().numpy()
         self._corners = triangles[hit.prim_index.numpy()[self.valid]]  # [hit, corner]
         u, v = hit.prim_uv.numpy()[:, self.valid].astype(np.float64)
         self._barycentric = np.stack([1 - u - v, u, v], axis=1)
-
-        self._origins, self._directions = (
-            np.asarray(vectors).T[self.valid].astype(np.float64) for vectors in (ray.o, ray.d)
+        self._origins, self._directions, self._points = (
+            np.asarray(vectors).T[self.valid].astype(np.float64) for vectors in (ray.o, ray.d, si.p)
         )
         beside = ray.o_x + hit.t * ray.d_x - ray(hit.t)  # one pixel of the film to the right
         self._pixel = dr.norm(beside).numpy()[self.valid] * film_pixels
-        a, b, c = (scene.positions[self._corners[:, k]].astype(np.float64) for k in range(3))
-        normals = np.cross(b - a, c - a)
-        facing = np.abs(np.einsum("ij,ij->i", normals, self._directions))
-        facing /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
+        facing = dr.abs(dr.dot(si.n, ray.d)).numpy()[self.valid].astype(np.float64)
         self.shade = AMBIENT + (1 - AMBIENT) * facing
-        self._points = np.einsum("ik,ikx->ix", self._barycentric, np.stack([a, b, c], axis=1))
 
     def interpolated(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n_v,) of vertices at the hits, (n,)."""

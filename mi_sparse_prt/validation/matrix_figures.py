@@ -91,7 +91,8 @@ def picture_row(pictures: Mapping[str, NDArray[np.floating]], cmap: str = "virid
     return figure
 
 
-def tonemapped(image: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Linear RGB as sRGB in [0, 1], the brightest tenth of a percent clipped."""
-    scaled = np.clip(image / max(float(np.percentile(image, 99.9)), 1e-20), 0, 1)
+def tonemapped(image: NDArray[np.floating], brightest: float | None = None) -> NDArray[np.floating]:
+    """Linear RGB as sRGB in [0, 1], 1 at ``brightest``; if not given, a tenth of a percent of the image is clipped."""
+    top = float(np.percentile(image, 99.9)) if brightest is None else brightest
+    scaled = np.clip(image / max(top, 1e-20), 0, 1)
     return np.where(scaled <= 0.0031308, 12.92 * scaled, 1.055 * scaled ** (1 / 2.4) - 0.055)

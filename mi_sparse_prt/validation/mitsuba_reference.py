@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
+from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
 from mi_sparse_prt.scene.scene import Scene
 
@@ -131,6 +132,21 @@ def reference_image(
     lit = lit_scene(scene.unlit_shapes(), background)
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
+
+
+def image_of_vertices(
+    scene: Scene,
+    irradiance: NDArray[np.float32],
+    background: mi.Emitter | None,
+    spp: int,
+    sensor: mi.Sensor | int = 0,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """Image (height, width, 3) of a scene from irradiance / pi (n_v, 3) at its vertices, by whatever method."""
+    integrator = RelitIntegrator(RelitScene(scene, irradiance, background))
+    return np.array(mi.render(scene.mitsuba, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[
+        ..., :3
+    ]
 
 
 def reference_vertices(

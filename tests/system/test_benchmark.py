@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.direct_speed import BareOcclusion
-from mi_sparse_prt.benchmark.kernels import kernels_of
-from mi_sparse_prt.benchmark.path_speed import MAX_DEPTH, SPP
+from mi_sparse_prt.benchmark.kernels import launched_kernels
+from mi_sparse_prt.benchmark.speed import MAX_DEPTH, SPP
 from mi_sparse_prt.cli import app
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -107,7 +107,7 @@ def test_one_kernel_serves_all_direct_blocks(scene, lighting):
     Result: as expected.
     """
     solver = DirectSolver(scene.normalised, lighting, vertex_points(scene))
-    found = kernels_of(lambda: [solver.rows(np.arange(*block, dtype=np.uint32)) for block in BLOCKS])
+    found = launched_kernels(lambda: [solver.rows(np.arange(*block, dtype=np.uint32)) for block in BLOCKS])
     assert found.launches == len(BLOCKS)
     assert found.distinct == 1
 
@@ -124,9 +124,9 @@ def test_a_baked_offset_would_be_found():
     def block(offset, size):
         return dr.eval(dr.gather(mi.Float, values, dr.arange(mi.UInt32, size) + offset) * 2)
 
-    baked = kernels_of(lambda: [block(a, b - a) for a, b in BLOCKS])
+    baked = launched_kernels(lambda: [block(a, b - a) for a, b in BLOCKS])
     assert baked.distinct == len(BLOCKS) == baked.compiled + baked.on_disk
-    assert kernels_of(lambda: [block(dr.opaque(mi.UInt32, a), b - a) for a, b in BLOCKS]).distinct == 1
+    assert launched_kernels(lambda: [block(dr.opaque(mi.UInt32, a), b - a) for a, b in BLOCKS]).distinct == 1
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -147,7 +147,7 @@ def test_one_kernel_serves_all_path_blocks(scene, lighting, channels):
         for n in (50, 31):
             solver.elements(rng.integers(28, size=n), rng.integers(96, size=n))
 
-    found = kernels_of(work)
+    found = launched_kernels(work)
     assert found.distinct == 1
     assert found.launches == len(BLOCKS) + 2
 

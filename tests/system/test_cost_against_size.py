@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import sizes
-from mi_sparse_prt.benchmark.one_size import measured_apart
-from mi_sparse_prt.benchmark.sizes import cost_against_size, edge_lengths
+from mi_sparse_prt.benchmark.size_costs import (
+    cost_against_size,
+    edge_lengths,
+    measure_in_own_process,
+    size_figure,
+)
 from mi_sparse_prt.core.errors import PrtError
 
 SCENE = """<scene version="3.0.0">
@@ -58,7 +61,7 @@ def test_one_size_in_a_process_of_its_own(scene_file):
     """
     hoard = np.ones(1 << 27)  # 1 GB
     case = {"path": str(scene_file), "parameters": {"height": "0.8"}, "resolution": 4, "method": "gather"}
-    found = measured_apart(**case, edge_length=0.5)
+    found = measure_in_own_process(**case, edge_length=0.5)
     assert found["vertices"] == prt.load_scene(scene_file, 0.5, height="0.8").n_vertices
     assert (found["resolution"], found["directions"], found["edge_length"]) == (4, 96, 0.5)
     direct, whole = found["direct"], found["whole"]
@@ -71,10 +74,12 @@ def test_one_size_in_a_process_of_its_own(scene_file):
 
 def test_what_a_process_refuses_is_said_here():
     with pytest.raises(PrtError, match=r"nowhere\.xml does not exist"):
-        measured_apart(path="nowhere.xml", parameters={}, edge_length=None, resolution=4, method="gather")
+        measure_in_own_process(
+            path="nowhere.xml", parameters={}, edge_length=None, resolution=4, method="gather"
+        )
 
 
-def test_report_and_figure(scene_file, monkeypatch, tmp_path):
+def test_report_and_figure(scene_file, tmp_path):
     """Expected: both series in order, a size that is refused is a sentence, a figure with both panels, and JSON."""
     asked = []
 
@@ -86,15 +91,15 @@ def test_report_and_figure(scene_file, monkeypatch, tmp_path):
         cost = {"seconds": n * case["resolution"] ** 2 / 1e6, "peak_memory_bytes": 3e8 + 1e3 * n}
         return {"vertices": n, "resolution": case["resolution"], "direct": cost, "whole": cost}
 
-    monkeypatch.setattr(sizes, "measured_apart", made_up)
-    monkeypatch.setattr(sizes, "COUNTS", (500, 1000, 2000))
-    report = cost_against_size(scene_file, {"height": "0.7"}, progress=False, figures=tmp_path)
+    report = cost_against_size(
+        scene_file, {"height": "0.7"}, False, tmp_path, counts=(500, 1000, 2000), measure=made_up
+    )
     assert json.loads(json.dumps(report)) == report
     assert all(case["parameters"] == {"height": "0.7"} and case["method"] == "auto" for case in asked)
     assert np.diff([point["vertices"] for point in report["by_vertices"]]).min() > 0
     assert {point["resolution"] for point in report["by_vertices"]} == {32}
     assert [point["resolution"] for point in report["by_resolution"]] == [8, 16, 32]
     assert report["skipped"] == ["edge length None, n = 64: the matrix needs 9 GB"]
-    figure = sizes.size_figure(report)
+    figure = size_figure(report)
     assert [axes.get_xscale() for axes in figure.axes] == ["log"] * 4
     assert (tmp_path / "cost_against_size.png").stat().st_size > 10_000

@@ -11,7 +11,8 @@ from conftest import build, diffuse
 from rich.console import Console
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import clustered_pca, glossy_transport
+from mi_sparse_prt.benchmark.clustered_pca import measure_cpca
+from mi_sparse_prt.benchmark.glossy_transport import GlossyEffort, diffuse_copy, measure_glossy
 from mi_sparse_prt.cli.tables.benchmark import cpca_tables, glossy_tables
 from mi_sparse_prt.scene.scene import Scene
 
@@ -40,11 +41,10 @@ def printed(tables: list) -> str:
     return console.file.getvalue()
 
 
-def test_cpca(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpca(tmp_path) -> None:
     """Both ways see the same rows; errors of two passes are those of the compressed matrix."""
-    monkeypatch.setattr(clustered_pca, "BASES", 6)
-    monkeypatch.setattr(clustered_pca, "SPP", 4)
-    report = clustered_pca.measure_cpca(tiny(diffuse(0.7, 0.7, 0.7)), prt.CubemapLighting(4), False, tmp_path)
+    scene = tiny(diffuse(0.7, 0.7, 0.7))
+    report = measure_cpca(scene, prt.CubemapLighting(4), False, tmp_path, bases=6, spp=4)
     json.dumps(report)
     assert report["meshes"].keys() == {"ball", "ground"}
     for found in report["meshes"].values():
@@ -63,14 +63,13 @@ def test_cpca(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ball" in printed(cpca_tables(report))
 
 
-def test_glossy(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_glossy(tmp_path) -> None:
     """Brute force is slower than finite elements, and takes its direct light from the same rays."""
-    for name, value in (("IMAGE_SPP", 8), ("IMAGE_WIDTH", 48), ("SPP", 4), ("ROWS", 8)):
-        monkeypatch.setattr(glossy_transport, name, value)
+    effort = GlossyEffort(rows=8, spp=4, image_spp=8, image_width=48)
     phong = {"type": "phong", "exponent": 20.0, "diffuse_reflectance": {"type": "rgb", "value": 0.2}}
     with pytest.warns(prt.PrtWarning, match="not diffuse"):
         scene = tiny(phong)
-    report = glossy_transport.measure_glossy(scene, prt.CubemapLighting(4), False, tmp_path)
+    report = measure_glossy(scene, prt.CubemapLighting(4), False, tmp_path, effort)
     json.dumps(report)
     seconds, ratios = report["seconds"], report["ratios"]
     assert ratios["glossy_over_diffuse"] == pytest.approx(seconds["glossy"] / seconds["diffuse"])
@@ -86,7 +85,7 @@ def test_glossy(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_diffuse_copy_has_the_same_vertices() -> None:
     with pytest.warns(prt.PrtWarning, match="not diffuse"):
         scene = tiny({"type": "roughplastic", "alpha": 0.3})
-    copy = glossy_transport.diffuse_copy(scene)
+    copy = diffuse_copy(scene)
     np.testing.assert_allclose(copy.positions, scene.positions, atol=1e-6)
     np.testing.assert_allclose(copy.normals, scene.normals, atol=1e-5)
     assert copy.diffuse

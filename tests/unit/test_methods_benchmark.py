@@ -1,24 +1,35 @@
 """The comparison of methods with brute force: what is known without running it, and once from end to end."""
 
 import json
+import time
 
 import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from conftest import COLOURS, build, diffuse, still_life
-from typer.testing import CliRunner
+from conftest import COLOURS, T, build, diffuse, still_life
+from rich.console import Console
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import brute_force_time as brute_force_times
-from mi_sparse_prt.benchmark import converged_reference, method_comparison, method_figures, relit_errors
-from mi_sparse_prt.benchmark.brute_force_time import time_rows
-from mi_sparse_prt.benchmark.converged_reference import Reference
+from mi_sparse_prt.benchmark.brute_force import BLOCKS, time_rows
+from mi_sparse_prt.benchmark.converged_reference import Reference, ReferenceEffort
 from mi_sparse_prt.benchmark.direct_error import direct_error
-from mi_sparse_prt.benchmark.estimates import joint_relative_l2, mean_square, relative_l2, row_errors
-from mi_sparse_prt.benchmark.machine import kept_memory
-from mi_sparse_prt.benchmark.relit_errors import RelitReference, environments_of, path_traced
-from mi_sparse_prt.cli import app
+from mi_sparse_prt.benchmark.measuring import kept_memory
+from mi_sparse_prt.benchmark.method_comparison import (
+    RAYS,
+    ComparisonEffort,
+    measure_methods,
+    seconds_of_stages,
+)
+from mi_sparse_prt.benchmark.method_figures import PictureEffort
+from mi_sparse_prt.benchmark.relit_reference import (
+    RelitEffort,
+    RelitReference,
+    environments_of,
+    path_traced,
+)
+from mi_sparse_prt.benchmark.sampled_norms import joint_relative_l2, mean_square, sampled_relative_l2
+from mi_sparse_prt.cli.tables.methods import methods_tables
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -41,16 +52,12 @@ SCENE = """<scene version="3.0.0">
 """
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Small references: noisy, but all of their parts take part."""
-    for module, values in (
-        (converged_reference, {"VERTICES": 120, "TEXELS": 12, "ELEMENT_SPP": 64, "ROWS": 24, "ROW_SPP": 16}),
-        (relit_errors, {"VERTICES": 20, "PATHS": 1024, "ROTATIONS": 4}),
-        (method_figures, {"PATHS": 64, "PIXEL_SAMPLES": 1, "WIDTH": 60}),
-    ):
-        for name, value in values.items():
-            monkeypatch.setattr(module, name, value)
+# Small references: noisy, but all of their parts take part
+QUICK = ComparisonEffort(
+    ReferenceEffort(vertices=120, texels=12, element_spp=64, rows=24, row_spp=16),
+    RelitEffort(vertices=20, paths=1024, rotations=4),
+    PictureEffort(paths=64, pixel_samples=1, width=60),
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +93,7 @@ def test_standard_error_of_a_relative_error():
         error, norm = 0.1 * rng.normal(size=(60, 1)), 1 + rng.random((60, 1))
         zero = np.zeros((60, 1))
         pair = mean_square(0.0, zero, error, error), mean_square(0.0, zero, norm, norm)
-        value, deviation = relative_l2(*pair)
+        value, deviation = sampled_relative_l2(*pair)
         values.append(value)
         deviations.append(deviation)
     assert np.mean(deviations) == pytest.approx(np.std(values), rel=0.25)
@@ -113,11 +120,6 @@ def test_error_of_two_meshes_together():
     assert np.mean(deviations) == pytest.approx(np.std(values), rel=0.25)
 
 
-def test_rows_in_the_dark_have_no_huge_errors():
-    errors = row_errors(np.array([1e-12, 0.04, 0.0]), np.array([0.0, 1.0, 1.0]))
-    np.testing.assert_allclose(errors, [np.sqrt(1e-12 / (1e-3 * 2 / 3)), 0.2, 0])
-
-
 # ---------------------------------------------------------------------------------------------- direct light, rows
 
 
@@ -141,10 +143,10 @@ def test_errors_of_the_direct_part(grey_scene, small_lighting, brute_force):
     size = rows[vertex, texel]
     assert found.relative_l2(mesh.name) == pytest.approx(size / np.linalg.norm(rows), rel=1e-5)
     assert found.relative_l2(grey_scene.meshes[0].name) == 0
-    row = found.worst_rows(mesh.name)
+    row = found.row_errors(mesh.name)
     assert row["vertex"] == mesh.vertices.start + vertex and row["95th_percentile"] == 0
     assert row["max"] == pytest.approx(size / np.linalg.norm(rows[vertex]), rel=1e-5)
-    column = found.worst_columns(mesh.name)
+    column = found.column_errors(mesh.name)
     assert column["texel"] == texel
     assert column["max"] == pytest.approx(size / np.linalg.norm(rows[:, texel]), rel=1e-5)
 
@@ -191,14 +193,14 @@ def test_no_light_is_no_light(grey_scene, small_lighting):
     assert not path_traced(grey_scene, small_lighting, dark, np.arange(3), 16, 0).any()
 
 
-def test_a_turn_of_the_circle_closes(quick, grey_scene, small_lighting, brute_force):
+def test_a_turn_of_the_circle_closes(grey_scene, small_lighting, brute_force):
     """
     Rationale: a matrix that is right has no error in any light.
     Expected: brute force with 64 paths has no direct error; its error under environments and its changes while one
         turns are a small share of the light's.
     Result: below 2%, where the light changes by more than 10%.
     """
-    relit = RelitReference(grey_scene, brute_force.direct, progress=False)
+    relit = RelitReference(grey_scene, brute_force.direct, progress=False, effort=QUICK.relit)
     assert list(relit.environments) == ["sky", "sun"] and relit.turning == "sun"  # the scene has no file
     np.testing.assert_array_equal(relit.lights[2], relit.lights[-1])
     report = relit.errors(brute_force)
@@ -211,23 +213,28 @@ def test_a_turn_of_the_circle_closes(quick, grey_scene, small_lighting, brute_fo
     assert all(0 < noise < 0.1 for of_mesh in relit.noise().values() for noise in of_mesh.values())
 
 
-def test_direct_errors_under_a_light_are_exact(quick, monkeypatch, grey_scene, small_lighting):
-    """Expected: without indirect light, where nothing is sampled, what the two matrices themselves give."""
-    scene = grey_scene
+def test_direct_errors_under_a_light_are_exact(small_lighting):
+    """Expected: without indirect light, where nothing is sampled, what the two matrices themselves give.
+
+    Two plates side by side: nothing is reflected between them.
+    """
+    beside = T().translate([3, 0, 0]).rotate([1, 0, 0], -90)
+    scene = build(
+        left={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": diffuse(0.5, 0.5, 0.5)},
+        right={"type": "rectangle", "to_world": beside, "bsdf": diffuse(0.6, 0.6, 0.6)},
+    )
     exact = prt.precompute(scene, small_lighting, "brute_force", max_depth=2, progress=False)
     bits = exact.direct.bits & np.uint32(0xFFFF00FF)
     wrong = prt.LightTransport(
         **vars(exact) | {"direct": type(exact.direct)(bits, exact.direct.normals, small_lighting)}
     )
-    monkeypatch.setattr(
-        relit_errors, "path_traced", lambda s, g, lights, ids, *_: np.zeros((len(lights), len(ids), 3))
-    )
-    relit = RelitReference(scene, exact.direct, progress=False)
+    relit = RelitReference(scene, exact.direct, progress=False, effort=QUICK.relit)
     light = small_lighting.project(relit.environments["sky"])
     found = relit.errors(wrong)["environments"]
     for mesh in scene.meshes:
         truth = exact.relight(light)[mesh.vertices]
         expected = np.linalg.norm(wrong.relight(light)[mesh.vertices] - truth) / np.linalg.norm(truth)
+        assert expected > 0.05
         assert found[mesh.name]["sky"]["relative_l2"] == pytest.approx(expected, rel=1e-4)
         assert found[mesh.name]["sky"]["standard_error"] < 1e-9
 
@@ -249,14 +256,14 @@ def test_environments_beside_the_scene(tmp_path):
 # ------------------------------------------------------------------------------------------------------- reference
 
 
-def test_errors_of_brute_force(quick, grey_scene, small_lighting, brute_force):
+def test_errors_of_brute_force(grey_scene, small_lighting, brute_force):
     """
     Rationale: a matrix whose every element is right within noise shows what the reference can tell.
     Expected: no direct error; the indirect error is that of its own paths (their variance is known), within four
         standard errors of the estimate; whole rows have errors of the same size.
     Result: as expected.
     """
-    measured = Reference(grey_scene, small_lighting, progress=False)
+    measured = Reference(grey_scene, small_lighting, progress=False, effort=QUICK.reference)
     errors, _ = measured.errors(brute_force)
     solver = measured.paths(64, 5)
     for mesh in grey_scene.meshes:
@@ -274,7 +281,7 @@ def test_errors_of_brute_force(quick, grey_scene, small_lighting, brute_force):
         assert found["direct_rows"]["max"] == found["direct_columns"]["max"] == 0
 
 
-def test_errors_of_all_meshes_together(quick, grey_scene, small_lighting, brute_force):
+def test_errors_of_all_meshes_together(grey_scene, small_lighting, brute_force):
     """
     Rationale: three ways to the error of path-traced light: elements of a matrix, of its paths, rows of the adjoint.
     Expected: the total is that of all squared errors over all squared norms, so it lies between those of the meshes,
@@ -282,7 +289,7 @@ def test_errors_of_all_meshes_together(quick, grey_scene, small_lighting, brute_
         element, within four standard errors.
     Result: as expected.
     """
-    measured = Reference(grey_scene, small_lighting, progress=False)
+    measured = Reference(grey_scene, small_lighting, progress=False, effort=QUICK.reference)
     everyone = np.arange(grey_scene.n_vertices)
     weights = small_lighting.solid_angles[:, None].astype(np.float64)
     albedo = grey_scene.albedo[:, :1, None].astype(np.float64)
@@ -306,45 +313,46 @@ def test_errors_of_all_meshes_together(quick, grey_scene, small_lighting, brute_
             assert abs(difference) < 4 * deviations["meshes"][mesh.name] + 0.002
         assert abs(found["total"] - expected(variance, everyone)) < 4 * deviations["total"] + 0.002
         assert 0 < deviations["total"] < found["total"]
-    assert 0 < measured.total_noise() < max(measured.noise().values())
+    noise = measured.noise()
+    assert 0 < noise["total"] < max(noise["meshes"].values())
 
 
-def test_brute_force_is_timed_on_successive_rows(monkeypatch):
+class Timed:
+    """A solver of n rows that notes which it is asked for; a row moves a clock on by its own amount."""
+
+    def __init__(self, seconds: np.ndarray) -> None:
+        self.points, self._seconds = seconds, seconds
+        self.traced: list[np.ndarray] = []
+        self.now = 0.0
+
+    def rows(self, ids: np.ndarray) -> None:
+        self.traced.append(np.asarray(ids))
+        self.now += self._seconds[ids].sum()
+
+
+def test_brute_force_is_timed_on_successive_rows():
     """Expected: whole wavefronts of successive vertices, one in each part of the scene; or all, once, if few."""
-    scene = build(edge_length=0.06, **still_life())
-    solver, n = (
-        PathSolver(scene.normalised, prt.CubemapLighting(4), vertex_points(scene)),
-        scene.n_vertices,
-    )
-    traced = []
-    monkeypatch.setattr(PathSolver, "rows", lambda _, ids: traced.append(np.asarray(ids)))
+    n = 2000
+    solver = Timed(np.ones(n))
     found = time_rows(solver, 32)
-    assert all((np.diff(ids) == 1).all() and len(ids) == 32 for ids in traced)
-    starts = np.array([ids[0] for ids in traced[1:]])
-    parts = brute_force_times.BLOCKS
-    assert found.rows == 32 * parts < n and len(starts) == parts
-    assert (np.abs(starts / n - (np.arange(parts) + 0.5) / parts) < 0.5 / parts + 64 / n).all()
+    assert all((np.diff(ids) == 1).all() and len(ids) == 32 for ids in solver.traced)
+    starts = np.array([ids[0] for ids in solver.traced[1:]])
+    assert found.rows == 32 * BLOCKS < n and len(starts) == BLOCKS
+    assert (np.abs(starts / n - (np.arange(BLOCKS) + 0.5) / BLOCKS) < 0.5 / BLOCKS + 64 / n).all()
 
-    traced.clear()
+    solver.traced.clear()
     found = time_rows(solver, n // 3)
-    np.testing.assert_array_equal(np.concatenate(traced[1:]), np.arange(n))
+    np.testing.assert_array_equal(np.concatenate(solver.traced[1:]), np.arange(n))
     assert found.rows == n and found.standard_error == 0
 
 
 def test_time_of_all_rows_from_some(monkeypatch):
     """Expected: with a clock that every row moves on by its own amount, the sum over all rows within four errors."""
-    scene = build(edge_length=0.06, **still_life())
-    solver = PathSolver(scene.normalised, prt.CubemapLighting(4), vertex_points(scene))
-    clock = [0.0]
-    each = 1 + 0.3 * np.random.default_rng(0).random(scene.n_vertices)
-
-    def rows(_, ids):
-        clock[0] += each[ids].sum()
-
-    monkeypatch.setattr(PathSolver, "rows", rows)
-    monkeypatch.setattr(brute_force_times.time, "perf_counter", lambda: clock[0])
+    each = 1 + 0.3 * np.random.default_rng(0).random(2000)
+    solver = Timed(each)
+    monkeypatch.setattr(time, "perf_counter", lambda: solver.now)
     found = time_rows(solver, 8)
-    assert found.rows < scene.n_vertices / 4
+    assert found.rows < len(each) / 4
     assert abs(found.seconds - each.sum()) < 4 * found.standard_error < 0.1 * each.sum()
 
 
@@ -360,7 +368,7 @@ def test_breakdown_adds_up():
         "unheard_of": 0.25,
         "total": 7.0,
     }
-    stages = method_comparison.breakdown(seconds)
+    stages = seconds_of_stages(seconds)
     assert sum(stages.values()) == pytest.approx(7)
     assert stages["dense rays"] == 4 and stages["rank"] == 0.5 and stages["system"] == pytest.approx(0.5)
 
@@ -368,28 +376,29 @@ def test_breakdown_adds_up():
 def test_a_method_that_cannot_be_compared():
     scene = build(plate={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)})
     with pytest.raises(PrtError, match="brute_force"):
-        method_comparison.measure_methods(scene, prt.CubemapLighting(2), ["brute_force"], progress=False)
+        measure_methods(scene, prt.CubemapLighting(2), ["brute_force"], progress=False)
 
 
-def test_from_end_to_end(quick, tmp_path):
+def test_from_end_to_end(tmp_path):
     """
-    Rationale: one command gives the counterpart of every table and figure of the paper.
+    Rationale: one call gives the counterpart of every table and figure of the paper.
     Expected: files of all figures; ratio and elements with the held-out ones are what their definitions say; JSON and
         table have the method.
     Result: as expected.
     """
-    scene, report_file, folder = tmp_path / "scene.xml", tmp_path / "report.json", tmp_path / "figures"
-    scene.write_text(SCENE)
-    arguments = ["benchmark", scene, "--resolution", 4, "--edge-length", 0.4, "--method", "sparse"]
-    arguments += ["--method", "gather", "--figures", folder, "--json", report_file]
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
-    assert result.exit_code == 0, result.output
-    report = json.loads(report_file.read_text())
+    folder = tmp_path / "figures"
+    (tmp_path / "scene.xml").write_text(SCENE)
+    scene = prt.load_scene(tmp_path / "scene.xml", 0.4)
+    report = measure_methods(scene, prt.CubemapLighting(4), ["sparse", "gather"], False, folder, QUICK)
+    assert json.loads(json.dumps(report)) == report
+    console = Console(width=160, record=True)
+    console.print(*methods_tables(report))
+    printed = console.export_text()
     assert list(report["methods"]) == ["sparse", "gather"]
     brute = report["brute_force"]
     assert brute["seconds"] == pytest.approx(brute["direct_seconds"] + brute["paths_seconds"])
     for method, found in report["methods"].items():
-        assert f"{method} against brute force" in result.stdout
+        assert f"{method} against brute force" in printed
         seconds, held_out = found["seconds"], found["estimated_error"]["elements"]
         total = report["scene"]["vertices"] * 96
         assert found["ratio"] == pytest.approx(seconds["total"] / brute["seconds"])
@@ -399,7 +408,7 @@ def test_from_end_to_end(quick, tmp_path):
         assert own + seconds["held_out"] == pytest.approx(seconds["total"])
         assert found["seconds_per_element"] == pytest.approx(found["ratio"] / found["elements"])
         assert sum(found["stages"].values()) == pytest.approx(seconds["total"])
-        rays = sum(found["stages"][name] for name in method_comparison.RAYS)
+        rays = sum(found["stages"][name] for name in RAYS)
         assert found["overhead"]["share"] == pytest.approx(1 - rays / seconds["total"])
         assert found["errors"]["floor"]["standard_error"]["total"] > 0
     assert report["methods"]["gather"]["overhead"]["microseconds_per_sparse_vertex"] is None

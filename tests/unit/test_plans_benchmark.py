@@ -7,7 +7,7 @@ from conftest import GREY, build, still_life
 from rich.console import Console
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark.plan_choice import SLOWER, _judged, measure_plans
+from mi_sparse_prt.benchmark.plan_choice import SLOWER, _against_best, measure_plans
 from mi_sparse_prt.cli.tables.benchmark import plans_tables
 from mi_sparse_prt.methods.plan import Plan
 
@@ -34,14 +34,14 @@ def test_the_best_is_the_quickest_that_is_good_enough():
     """
     plans = [Plan("consensus", "gather", rays) for rays in (64, 256, 1024)]
     done = [carried_out(*p) for p in zip(plans, (1.0, 2.0, 5.0), (0.03, 0.019, 0.005), strict=True)]
-    loose = _judged(0.02, auto(plans[2], 8.0, 0.005), done)
+    loose = _against_best(0.02, auto(plans[2], 8.0, 0.005), done)
     assert loose["best"] == done[1]
     assert (loose["choice"], loose["whole"], loose["met"], loose["attempts"]) == (2.5, 2.0, True, 1)
-    assert _judged(0.01, auto(plans[2], 8.0, 0.005), done)["choice"] == 1.0
-    tight = _judged(0.001, auto(plans[2], 8.0, 0.005), done)
+    assert _against_best(0.01, auto(plans[2], 8.0, 0.005), done)["choice"] == 1.0
+    tight = _against_best(0.001, auto(plans[2], 8.0, 0.005), done)
     assert (tight["best"], tight["choice"], tight["whole"], tight["met"]) == (None, None, None, False)
-    assert _judged(0.02, auto(plans[1], 8.0, 0.021), done)["met"]
-    assert not _judged(0.02, auto(plans[1], 8.0, 0.0221), done)["met"]
+    assert _against_best(0.02, auto(plans[1], 8.0, 0.021), done)["met"]
+    assert not _against_best(0.02, auto(plans[1], 8.0, 0.0221), done)["met"]
 
 
 def test_every_plan_is_carried_out_that_may_be_as_quick():

@@ -9,10 +9,7 @@ import pytest
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.neighbour_radius import (
     CURVES,
-    _all_directions,
-    _at_radius,
-    _blocks,
-    _sampled,
+    _draw_samples,
     error_against_radius,
     plot_error_against_radius,
 )
@@ -56,7 +53,7 @@ def report(scene: prt.Scene) -> dict:
 
 def test_errors_are_those_of_vertices_one_at_a_time(scene: prt.Scene, report: dict) -> None:
     """Distances by hand, lstsq in float64 for "full", and the solver itself, one problem at a time, for L1."""
-    samples = _sampled(scene, prt.CubemapLighting(RESOLUTION), _mesh(scene), VERTICES, 0)
+    samples = _draw_samples(scene, prt.CubemapLighting(RESOLUTION), _mesh(scene), VERTICES)
     squared = {"l1": 0.0, "full": 0.0}
     neighbours = 0
     for p, exact in zip(samples.positions, samples.exact, strict=True):
@@ -98,30 +95,6 @@ def test_a_fit_to_all_directions_is_the_best(report: dict) -> None:
     assert (full <= np.minimum(report["error"]["l1"], report["error"]["least_squares"]) * (1 + 1e-6)).all()
     assert (np.diff(full) <= 1e-6 * full[:-1]).all()
     assert report["weights"]["l1"][2] < report["weights"]["full"][2]
-
-
-def test_systems_of_all_directions_are_those_of_a_list_of_them(scene: prt.Scene) -> None:
-    samples = _sampled(scene, prt.CubemapLighting(RESOLUTION), _mesh(scene), VERTICES, 0)
-    ids, near = np.arange(3, 9), np.random.default_rng(0).integers(-1, len(samples.dense), (6, 12), np.int32)
-    every = np.tile(np.arange(6 * RESOLUTION**2, dtype=np.int32), (6, 1))
-    expected = normal_equations(samples.dense, near, every, samples.exact[ids])
-    for found, known in zip(_all_directions(samples, ids, near), expected, strict=True):
-        np.testing.assert_allclose(found, known, rtol=1e-10, atol=1e-18)
-
-
-def test_blocks_hold_every_vertex_once_and_bounded_systems() -> None:
-    known = np.random.default_rng(0).integers(0, 700, 300)
-    blocks = _blocks(known)
-    assert sorted(np.concatenate(blocks)) == list(range(300))
-    assert all(len(ids) * int(known[ids].max()) ** 2 <= 1 << 22 for ids in blocks)
-
-
-def test_blocks_do_not_change_the_result(scene: prt.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    samples = _sampled(scene, prt.CubemapLighting(RESOLUTION), _mesh(scene), VERTICES, 0)
-    _, together, _ = _at_radius(samples, 0.2, DIRECTIONS, 1e-2)
-    monkeypatch.setattr("mi_sparse_prt.benchmark.neighbour_radius.MOST_TOGETHER", 1)
-    _, alone, _ = _at_radius(samples, 0.2, DIRECTIONS, 1e-2)
-    np.testing.assert_allclose(together, alone, rtol=1e-3)
 
 
 def test_the_plot_has_all_curves(report: dict) -> None:

@@ -7,10 +7,13 @@ import pytest
 from conftest import COLOURS, build, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.benchmark import converged_reference, time_error
-from mi_sparse_prt.benchmark.column_methods import CHOICES, _of_nearest, precompute_with_columns
-from mi_sparse_prt.benchmark.columns import random_columns
-from mi_sparse_prt.benchmark.time_error import time_against_error
+from mi_sparse_prt.benchmark.column_sampling import (
+    columns_of_nearest,
+    precompute_with_columns,
+    random_columns,
+)
+from mi_sparse_prt.benchmark.converged_reference import ReferenceEffort
+from mi_sparse_prt.benchmark.time_error import TimeErrorEffort, run_methods, time_against_error
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.estimation import held_out
@@ -31,29 +34,26 @@ def scene() -> prt.Scene:
     return build(edge_length=0.15, **still_life(COLOURS))
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Small references and few efforts: noisy, but all parts take part."""
-    for module, values in (
-        (converged_reference, {"VERTICES": 180, "TEXELS": 12, "ROWS": 36, "ROW_SPP": 32}),
-        (time_error, {"SPPS": (1, 4), "ADJOINT_SPPS": (2, 8), "TARGETS": (0.2, 0.05), "SPP": 4}),
-        (held_out, {"SPP": 32}),
-    ):
-        for name, value in values.items():
-            monkeypatch.setattr(module, name, value)
+# Small references and few efforts: noisy, but all parts take part
+QUICK = TimeErrorEffort(
+    spp=4,
+    brute_force_spps=(1, 4),
+    adjoint_spps=(2, 8),
+    targets=(0.2, 0.05),
+    reference=ReferenceEffort(vertices=180, texels=12, element_spp=256, rows=36, row_spp=32),
+)
 
 
 # ------------------------------------------------------------------------------------------------ regional columns
 
 
-def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting, monkeypatch):
+def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting):
     """
     Rationale: all vertices of a region share the columns that its dense rows say; regions of two meshes are apart.
     Expected: vertices whose nearest dense one is the same have the same columns, and the columns of a mesh are chosen
         from its own rows: a row that is zero everywhere but at a few directions gives these and no others.
     Result: as expected.
     """
-    monkeypatch.setattr("mi_sparse_prt.benchmark.columns.REGION", 60)
     points = vertex_points(scene)
     sampler = DenseSampler(
         scene, DirectSolver(scene.normalised, lighting, points), AngularGrid(lighting), Stopwatch()
@@ -64,7 +64,7 @@ def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting, monkeypa
     rows = np.zeros((len(dense.ids), lighting.n_directions), np.float32)
     for k, mesh in enumerate(scene.meshes):
         rows[dense.of_mesh(mesh), 10 * k : 10 * k + 10] = 1
-    columns = _of_nearest(scene, dense, rows, random_columns, seed=0)
+    columns = columns_of_nearest(scene, dense, rows, random_columns, seed=0, size=60)
     nearest = np.arange(len(dense.ids), dtype=np.int32)
     directions = columns(np.stack([nearest, nearest[::-1]], axis=1))
     assert directions.shape == (len(dense.ids), round(0.06 * lighting.n_directions))
@@ -75,13 +75,13 @@ def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting, monkeypa
         sets[mesh.name] = len(np.unique(own, axis=0))
     assert max(sets.values()) == 1  # ten columns for ten places: every region has the same
     rows[:] = np.random.default_rng(0).random(rows.shape)
-    directions = _of_nearest(scene, dense, rows, random_columns, seed=0)(nearest[:, None])
+    directions = columns_of_nearest(scene, dense, rows, random_columns, 0, size=60)(nearest[:, None])
     ground = scene.meshes[0]
     regions = np.unique(directions[dense.of_mesh(ground)], axis=0)
     assert len(regions) == round((ground.vertices.stop - ground.vertices.start) / 60)
 
 
-@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("choice", ["clustered_columns", "k_means_columns"])
 def test_a_matrix_by_regional_columns(choice, scene, lighting):
     """
     Rationale: a peer that is broken would make all others look good.
@@ -131,26 +131,32 @@ def test_the_papers_columns_are_the_default(grey_scene, small_lighting):
 # --------------------------------------------------------------------------------------------------- end to end
 
 
-def test_time_against_error_from_end_to_end(quick, monkeypatch, coloured_scene, small_lighting, tmp_path):
+def test_a_method_that_refuses_the_scene_is_a_sentence(scene, lighting):
+    """Expected: the others are still run."""
+
+    def refuse(*_, **__):
+        raise PrtError("not this scene")
+
+    outcomes = dict(
+        run_methods({"refusing": refuse, "auto": lambda *_, **__: "matrix"}, scene, lighting, 1, False)
+    )
+    assert isinstance(outcomes["refusing"], PrtError) and outcomes["auto"] == "matrix"
+
+
+def test_time_against_error_from_end_to_end(monkeypatch, coloured_scene, small_lighting, tmp_path):
     """
     Rationale: the plot is what a reader judges methods by.
-    Expected: every method has a point or a sentence why not; ratios are what their definitions say; brute force's
+    Expected: every method has a point; ratios are what their definitions say; brute force's
         errors fall as 1 / sqrt(paths) within their standard errors; JSON as it is; a figure for all meshes and each.
     Result: as expected.
     """
-
-    def refuse(*_):
-        raise PrtError("not this scene")
-
-    scene, known, chosen = coloured_scene, time_error.methods(), ["k_means_columns", "gather", "auto 0.2"]
-    monkeypatch.setattr(time_error, "methods", lambda: known | {"refusing": refuse})
-    report = time_against_error(
-        scene, small_lighting, False, tmp_path, only=[*chosen, "refusing"], reference_spp=256
-    )
+    monkeypatch.setattr(held_out, "SPP", 32)
+    scene, chosen = coloured_scene, ["k_means_columns", "gather", "auto 0.2"]
+    report = time_against_error(scene, small_lighting, False, tmp_path, chosen, effort=QUICK)
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
     assert list(report["methods"]) == chosen
-    assert report["skipped"] == ["refusing: not this scene"]
+    assert report["skipped"] == []
     one, four = report["brute_force"]
     assert [one["spp"], four["spp"]] == [1, 4]
     errors = [point["relative_l2"]["total"] for point in (one, four)]

@@ -1,14 +1,15 @@
-"""What a timing depends on besides the code: processor, memory, versions, and the size of the problem."""
+"""What a timing needs and depends on: a clock, memory that stays, processor, versions, and the size of the problem."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import platform
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import psutil
@@ -19,6 +20,15 @@ from mi_sparse_prt.scene.scene import Scene
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # parameters of mallopt in glibc's malloc.h
 _DEFAULTS = {_TRIM_THRESHOLD: 128 << 10, _MMAP_MAX: 65536}
+
+Result = TypeVar("Result")
+
+
+def timed(work: Callable[..., Result], *arguments: Any) -> tuple[float, Result]:
+    """Seconds that a call takes, and what it returns."""
+    start = time.perf_counter()
+    result = work(*arguments)
+    return time.perf_counter() - start, result
 
 
 @contextmanager

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.metrics import relative_l2_from_squares
+
 RESAMPLINGS = 1000
-FLOOR = 1e-3  # rows in the dark: norms count as at least this share of the mean square of all rows
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def mean_square(
     known : float
         Mean of d^2 over everything.
     at_samples : (k, ...) float
-        d at the sampled vertices.
+        d at the sampled vertices; broadcast.
     x, y : (k, ...) float
         Two independent estimates of r there.
     """
@@ -56,7 +57,7 @@ def mean_square(
     return MeanSquare(known, rest.reshape(len(rest), -1).mean(axis=1))
 
 
-def relative_l2(error: MeanSquare, norm: MeanSquare) -> tuple[float, float]:
+def sampled_relative_l2(error: MeanSquare, norm: MeanSquare) -> tuple[float, float]:
     """sqrt(error / norm) and its standard error, by a bootstrap over the sampled vertices, which both may share."""
     return joint_relative_l2([error], [norm], [1])
 
@@ -73,12 +74,14 @@ def joint_relative_l2(
     sizes : sequence of float
         How many vertices each mesh has.
     """
-    square, squares = _together(errors, sizes)
-    norm, resampled = _together(norms, sizes)
-    return float(_root(square, norm)), float(_root(squares, resampled).std())
+    square, squares = _weighted_sum(errors, sizes)
+    norm, resampled = _weighted_sum(norms, sizes)
+    return float(relative_l2_from_squares(square, norm)), float(
+        relative_l2_from_squares(squares, resampled).std()
+    )
 
 
-def _together(parts: Sequence[MeanSquare], sizes: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
+def _weighted_sum(parts: Sequence[MeanSquare], sizes: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
     """Sum over meshes of size times mean square, and the same of resampled vertices (RESAMPLINGS,)."""
     value, resampled = 0.0, np.zeros(RESAMPLINGS)
     for mesh, (part, size) in enumerate(zip(parts, sizes, strict=True)):
@@ -88,14 +91,3 @@ def _together(parts: Sequence[MeanSquare], sizes: Sequence[float]) -> tuple[floa
         drawn = np.random.default_rng([mesh, k]).integers(k, size=(RESAMPLINGS, k))
         resampled += size * (part.known + part.rest[drawn].mean(axis=1))
     return value, resampled
-
-
-def row_errors(squares: NDArray[np.floating], norms: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Relative L2 (n,) of rows from their squared errors and squared norms; rows in the dark count as dim ones."""
-    return _root(squares, np.maximum(norms, FLOOR * norms.mean()))
-
-
-def _root(square: NDArray[np.floating] | float, norm: NDArray[np.floating] | float) -> NDArray[np.float64]:
-    """sqrt(square / norm); 0 for a square below zero (noise about zero), and where both are 0."""
-    square, norm = np.broadcast_arrays(np.maximum(square, 0.0), norm)
-    return np.sqrt(np.divide(square, norm, out=np.where(square > 0, 1.0, 0.0), where=norm > 0))

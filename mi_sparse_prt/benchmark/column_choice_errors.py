@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,18 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.columns import (
-    SHARE,
-    Columns,
-    clustered_columns,
-    columns_of_regions,
-    k_means_columns,
-    random_columns,
-    regions,
-)
-from mi_sparse_prt.benchmark.exact_rows import mesh_named, traced_rows, white_rows
+from mi_sparse_prt.benchmark.column_sampling import CHOICES, SHARE, Columns, columns_of_regions, regions
+from mi_sparse_prt.benchmark.exact_rows import mesh_named, trace_visibility, unit_albedo_rows, values_at
+from mi_sparse_prt.benchmark.measuring import timed
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.metrics import relative_l2_of_sample
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.neighbours import radius_neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -51,11 +44,6 @@ INTERPOLATED = {
     "inverse_distance": "inverse distance",
     "linear": "linear (moving least squares)",
 }
-BY_REGION = {
-    "clustered_columns": clustered_columns,
-    "k_means_columns": k_means_columns,
-    "random_columns": random_columns,
-}
 
 
 @dataclass(frozen=True)
@@ -77,8 +65,8 @@ class _Surface:
     lighting: CubemapLighting
 
     def rows(self, ids: NDArray[np.integer]) -> NDArray[np.float32]:
-        """White rows (len(ids), n_directions)."""
-        return white_rows(self.bits[ids], self.normals[ids], self.lighting)
+        """Unit-albedo rows (len(ids), n_directions)."""
+        return unit_albedo_rows(self.bits[ids], self.normals[ids], self.lighting)
 
     def features(self, ids: NDArray[np.integer]) -> Bits:
         """Directions that the second angular pass would add at these vertices."""
@@ -185,13 +173,17 @@ def compare_choices(
     if not norms.any():
         raise PrtError(f"the mesh {mesh!r} sees no light at {len(sample)} vertices: choose another mesh")
 
-    region = regions(surface.positions[by_rank], n, seed)
-    results = _from_rank(surface, _local(surface, sample, by_rank), region, count, seed, progress)
+    local, region = _local(surface, sample, by_rank), regions(surface.positions[by_rank], n, seed)
+    results = {"features": _by_vertex(local, count, n - len(by_rank)), **_interpolations(surface, local)}
+    for name in tqdm(CHOICES, desc="columns", disable=not progress):
+        results[name] = _by_region(local, region, CHOICES[name], count, seed)
     results["random_rows"] = _by_vertex(_local(surface, sample, at_random), count, n - len(at_random))
     errors = {}
     for name in (*FITTED, *INTERPOLATED):
-        dense = np.isin(sample, at_random if name == "random_rows" else by_rank)
-        errors[name] = _relative(results[name].squared, norms, dense)
+        squares = np.zeros(len(sample))  # dense rows are exact
+        sparse = ~np.isin(sample, at_random if name == "random_rows" else by_rank)
+        squares[sparse] = results[name].squared
+        errors[name] = relative_l2_of_sample(squares, norms)
     return {
         "scene": scene.path,
         "mesh": mesh,
@@ -234,7 +226,7 @@ def plot_choices(report: dict[str, Any]) -> Figure:
 def _surface(scene: Scene, lighting: CubemapLighting, name: str) -> _Surface:
     inside, points = mesh_named(scene, name).vertices, vertex_points(scene)
     direct = DirectSolver(scene.normalised, lighting, points)
-    bits = traced_rows(direct, np.arange(inside.start, inside.stop, dtype=np.uint32))
+    bits = trace_visibility(direct, np.arange(inside.start, inside.stop, dtype=np.uint32))
     return _Surface(
         scene.normalised_positions[inside], scene.normals[inside], points.keys[inside], bits, lighting
     )
@@ -253,40 +245,24 @@ def _local(surface: _Surface, sample: NDArray[np.int64], dense: NDArray[np.int64
     return _Local(surface.rows(sparse), sparse, dense, surface.rows(dense), surface.features(dense), near)
 
 
-def _from_rank(
-    surface: _Surface, local: _Local, region: NDArray[np.int64], count: int, seed: int, progress: bool
-) -> dict[str, _Result]:
-    """All choices but ``random_rows``, from dense rows chosen by rank."""
-    results = {"features": _by_vertex(local, count, len(surface.positions) - len(local.dense))}
-    for name in tqdm(BY_REGION, desc="columns", disable=not progress):
-        results[name] = _by_region(local, region, BY_REGION[name], count, seed)
-    return results | _interpolations(surface, local)
-
-
 def _by_vertex(local: _Local, count: int, n_sparse: int) -> _Result:
     """Columns chosen for each sparse vertex; of such the whole mesh has `n_sparse`."""
     choose_features(local.near[:1], local.rows, local.features, count)  # compiles
-    start = time.perf_counter()
-    directions = choose_features(local.near, local.rows, local.features, count)
-    seconds = (time.perf_counter() - start) * n_sparse / len(local.sparse)
-    return _fitted(local, directions, seconds)
+    seconds, directions = timed(choose_features, local.near, local.rows, local.features, count)
+    return _fitted(local, directions, seconds * n_sparse / len(local.sparse))
 
 
 def _by_region(local: _Local, region: NDArray[np.int64], choose: Columns, count: int, seed: int) -> _Result:
     """Columns chosen for each region; a sparse vertex belongs to that of the nearest dense one."""
-    start = time.perf_counter()
-    table = columns_of_regions(local.rows, region, choose, count, seed)
-    seconds = time.perf_counter() - start
+    seconds, table = timed(columns_of_regions, local.rows, region, choose, count, seed)
     return _fitted(local, table[region[local.near[:, 0]]], seconds)
 
 
 def _fitted(local: _Local, directions: NDArray[np.int32], seconds: float) -> _Result:
     """L1 weights of the neighbours from the exact values at directions (n, s), -1 where there are fewer."""
     known = directions >= 0
-    values = np.where(
-        known, np.take_along_axis(local.exact, np.maximum(directions, 0), axis=1), np.float32(0)
-    )
-    weights = l1_fit(*normal_equations(local.rows, local.near, directions, values), RELATIVE_LAMBDA).weights
+    equations = normal_equations(local.rows, local.near, directions, values_at(local.exact, directions))
+    weights = l1_fit(*equations, RELATIVE_LAMBDA).weights
     # no directions, no equations: the neighbours' mean, as in huang2010
     alone = ~known.any(axis=1)
     present = local.near[alone] >= 0
@@ -316,19 +292,3 @@ def _squared(local: _Local, near: NDArray[np.int32], weights: NDArray[np.floatin
         error = w[ids >= 0] @ local.rows[ids[ids >= 0]] - local.exact[v]
         squared[v] = (error**2).sum(dtype=np.float64)
     return squared
-
-
-def _relative(
-    squared: NDArray[np.float64], norms: NDArray[np.float64], dense: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Relative L2 error of a sample, and its standard error, by the squared errors of rows that are not dense.
-
-    The square of the error is a ratio of means; its variance is that of the numerator less the ratio times the
-    denominator, to first order.
-    """
-    all_squared = np.zeros(len(norms))
-    all_squared[~dense] = squared
-    ratio = all_squared.sum() / norms.sum()
-    deviation = np.sqrt(((all_squared - ratio * norms) ** 2).sum()) / norms.sum()
-    error = float(np.sqrt(ratio))
-    return error, float(deviation / (2 * error)) if error else 0.0

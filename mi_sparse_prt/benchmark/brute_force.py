@@ -1,4 +1,4 @@
-"""How much longer brute force takes for the same error, from its time and noise at a few numbers of paths."""
+"""Brute force's time and error: of all rows from some blocks of them, for any number of paths from a few."""
 
 from __future__ import annotations
 
@@ -6,6 +6,55 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from mi_sparse_prt.benchmark.measuring import timed
+from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+
+ROWS, BLOCKS = 128, 16  # at least
+
+
+@dataclass(frozen=True)
+class RowsTime:
+    """Time of all rows of a scene.
+
+    Attributes
+    ----------
+    seconds, standard_error : float
+        Of all rows, extrapolated from some; the latter from the spread between blocks.
+    rows : int
+        How many were timed.
+    """
+
+    seconds: float
+    standard_error: float
+    rows: int
+
+
+def time_rows(solver: PathSolver | AdjointSolver, size: int) -> RowsTime:
+    """Time blocks of successive vertices, one at a random place in each of as many equal parts of a scene.
+
+    Parameters
+    ----------
+    solver : PathSolver or AdjointSolver
+        At the scene's vertices, mesh after mesh. If there are fewer blocks, all are timed.
+    size : int
+        Vertices in a block: as many as a full run traces together.
+    """
+    n, rng = len(solver.points), np.random.default_rng(2)
+    solver.rows(np.arange(min(n, size), dtype=np.uint32))  # compiles
+    starts = np.arange(0, n, size)
+    count = max(BLOCKS, -(-ROWS // size))
+    if len(starts) > count:
+        starts = np.array([rng.choice(part) for part in np.array_split(starts[: n // size], count)])
+    blocks = [np.arange(a, min(a + size, n), dtype=np.uint32) for a in starts.tolist()]
+    lengths = np.array([len(block) for block in blocks])
+    seconds = np.array([timed(solver.rows, block)[0] for block in blocks])
+    if lengths.sum() == n:
+        return RowsTime(float(seconds.sum()), 0.0, n)
+    per_row = seconds / lengths
+    error = n * float(per_row.std(ddof=1)) / float(np.sqrt(len(blocks)))
+    return RowsTime(n * float(per_row.mean()), error, int(lengths.sum()))
 
 
 @dataclass(frozen=True)
@@ -37,10 +86,6 @@ class BruteForce:
         deviation = np.array(self.standard_errors) * np.sqrt(self.spp)
         return float(np.average(at_one, weights=1 / np.maximum(deviation, 1e-9) ** 2))
 
-    def error(self, spp: float) -> float:
-        """Relative L2 of the whole matrix."""
-        return self.noise / float(np.sqrt(spp))
-
     def seconds(self, spp: float) -> float:
         """Of the whole matrix."""
         if spp > self.spp[-1]:
@@ -66,9 +111,4 @@ class BruteForce:
             return {"spp": None, "seconds": None, "speed_up": None, "extrapolated": None}
         spp = max(1.0, (self.noise / error) ** 2)
         own = self.seconds(spp)
-        return {
-            "spp": spp,
-            "seconds": own,
-            "speed_up": own / seconds,
-            "extrapolated": spp > self.spp[-1],
-        }
+        return {"spp": spp, "seconds": own, "speed_up": own / seconds, "extrapolated": spp > self.spp[-1]}

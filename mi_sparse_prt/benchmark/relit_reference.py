@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.benchmark.estimates import MeanSquare, mean_square, relative_l2
+from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
+from mi_sparse_prt.benchmark.sampled_norms import MeanSquare, mean_square, sampled_relative_l2
 from mi_sparse_prt.core.errors import PrtWarning
+from mi_sparse_prt.core.metrics import relative_l2_from_squares
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import SUFFIXES, Environment, load_environment
@@ -22,13 +24,31 @@ from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.transport import LightTransport
 
-MAX_DEPTH = 5
 FOLDER = "envmaps"  # beside a scene's file
-ROTATIONS = 36
-VERTICES = 1000  # per mesh, at random, at which indirect light is path traced
-PATHS = 8192  # per vertex, in each of two halves, shared by all lights
 PATHS_TOGETHER = 1 << 21
 SEED = (1 << 30) + 4
+
+
+@dataclass(frozen=True)
+class RelitEffort:
+    """How well the light of relit vertices is known.
+
+    Attributes
+    ----------
+    vertices : int
+        Per mesh, at random, at which indirect light is path traced.
+    paths : int
+        Per vertex, in each of two halves, shared by all lights.
+    rotations : int
+        Frames of a full turn.
+    """
+
+    vertices: int = 1000
+    paths: int = 8192
+    rotations: int = 36
+
+
+CONVERGED = RelitEffort()
 
 
 def environments_of(scene: Scene) -> dict[str, Environment]:
@@ -68,7 +88,7 @@ def path_traced(
     seed: int,
     progress: bool = False,
 ) -> NDArray[np.float64]:
-    """Indirect light of white vertices under environments, without bias and without a matrix.
+    """Indirect light of vertices of unit albedo under environments, without bias and without a matrix.
 
     Texels are drawn for each vertex in proportion to the power that they have in the mean of all lights, one path
     each; so the same paths serve all lights, and none is lit by less than its share of them.
@@ -116,7 +136,7 @@ def _sums(
     paths: int,
     seed: int,
 ) -> NDArray[np.float64]:
-    """Sums (k, n_directions, channels) of white transport density over the paths of each vertex, by texel."""
+    """Sums (k, n_directions, channels) of unit-albedo transport density over the paths of each vertex, by texel."""
     rng = np.random.default_rng([seed, int(vertices[0])])
     stratified = (np.arange(paths) + rng.random((len(vertices), 1))) / paths  # [vertex, path]
     cumulative = np.cumsum(share)
@@ -178,32 +198,33 @@ class RelitReference:
     direct : Visibility
         Exact bits.
     progress : bool
+    effort : RelitEffort, optional
     """
 
-    def __init__(self, scene: Scene, direct: Visibility, progress: bool) -> None:
+    def __init__(
+        self, scene: Scene, direct: Visibility, progress: bool, effort: RelitEffort = CONVERGED
+    ) -> None:
         lighting = direct.lighting
-        self.scene = scene
+        self.scene, self._effort = scene, effort
         self.environments = environments_of(scene)
         self.turning = max(self.environments, key=lambda name: _sharpness(self.environments[name], lighting))
-        self.degrees = 360 / ROTATIONS * np.arange(ROTATIONS + 1)
+        self.degrees = 360 / effort.rotations * np.arange(effort.rotations + 1)
+        turning = self.environments[self.turning]
         still = [lighting.project(environment) for environment in self.environments.values()]
-        turned = [
-            lighting.project(self.environments[self.turning].rotated(float(a))) for a in self.degrees[:-1]
-        ]
-        self.lights = np.stack(
-            [*still, *turned, turned[0]]
-        )  # [light, texel, rgb]; the last turn closes the circle
+        turned = [lighting.project(turning.rotated(float(a))) for a in self.degrees[:-1]]
+        # [light, texel, rgb]; the last turn closes the circle
+        self.lights = np.stack([*still, *turned, turned[0]])
         self._still, self._turned = slice(0, len(still)), slice(len(still), None)
         albedo = scene.albedo.astype(np.float64)
-        direct_light = np.stack([direct.relight(light) for light in self.lights]) * albedo
+        direct_light = self._relit_by(direct)
         rng = np.random.default_rng(3)
         self._relit: dict[str, _Relit] = {}
         for mesh in scene.meshes:
             n, inside = mesh.vertices.stop - mesh.vertices.start, mesh.vertices
-            samples = np.sort(rng.choice(n, min(n, VERTICES), replace=False))
+            samples = np.sort(rng.choice(n, min(n, effort.vertices), replace=False))
             ids = samples + inside.start
             x, y = (
-                path_traced(scene, lighting, self.lights, ids, PATHS, SEED + k, progress) * albedo[ids]
+                path_traced(scene, lighting, self.lights, ids, effort.paths, SEED + k, progress) * albedo[ids]
                 for k in (0, 1)
             )
             self._relit[mesh.name] = _Relit(direct_light[:, inside], samples, x, y)
@@ -217,8 +238,8 @@ class RelitReference:
             },
             "rotation": {
                 "environment": self.turning,
-                "reference": f"direct light exact at all vertices, indirect light path traced at {VERTICES} of each "
-                f"mesh, {PATHS} paths in each of two halves",
+                "reference": f"direct light exact at all vertices, indirect light path traced at "
+                f"{self._effort.vertices} of each mesh, {self._effort.paths} paths in each of two halves",
                 "degrees": self.degrees[:-1].tolist(),
                 "meshes": {name: self._turning(relit, ours[name]) for name, relit in self._relit.items()},
             },
@@ -231,19 +252,17 @@ class RelitReference:
             norms = [square.value for square in relit.squares()[self._still]]
             noise = [((x - y) ** 2).mean() / 4 for x, y in zip(relit.x, relit.y, strict=True)]
             found[mesh] = {
-                name: float(np.sqrt(a / b)) if b > 0 else 0.0
+                name: float(relative_l2_from_squares(a, b))
                 for name, a, b in zip(self.environments, noise, norms, strict=False)
             }
         return found
 
     def _errors_of(self, transport: LightTransport) -> dict[str, _Relit]:
         """Error of the radiance under all lights, per mesh."""
-        albedo = self.scene.albedo.astype(np.float64)
-        first, later = transport.operators["direct"], transport.operators.get("indirect")
-        direct = np.stack([first.relight(light) for light in self.lights]) * albedo
+        direct = self._relit_by(transport.direct)
         indirect = np.zeros(direct.shape)
-        if later is not None:
-            indirect = np.stack([later.relight(light) for light in self.lights]) * albedo
+        if transport.indirect is not None:
+            indirect = self._relit_by(transport.indirect)
         found = {}
         for mesh in self.scene.meshes:
             relit, inside = self._relit[mesh.name], mesh.vertices
@@ -252,9 +271,13 @@ class RelitReference:
             found[mesh.name] = _Relit(known, relit.samples, ours - relit.x, ours - relit.y)
         return found
 
+    def _relit_by(self, part: Any) -> NDArray[np.float64]:
+        """What leaves the vertices under all lights, (l, n_v, 3)."""
+        return np.stack([part.relight(light) for light in self.lights]) * self.scene.albedo.astype(np.float64)
+
     def _under_environments(self, relit: _Relit, error: _Relit) -> dict[str, Any]:
         pairs = zip(error.squares()[self._still], relit.squares()[self._still], strict=True)
-        values = [relative_l2(*pair) for pair in pairs]
+        values = [sampled_relative_l2(*pair) for pair in pairs]
         each = {
             name: {"relative_l2": value, "standard_error": deviation}
             for name, (value, deviation) in zip(self.environments, values, strict=True)
@@ -270,7 +293,7 @@ class RelitReference:
             "change_of_light": relit.changes().squares()[self._turned],
         }
         frames = {
-            name: [relative_l2(a, b)[0] for a, b in zip(squares, norms, strict=True)]
+            name: [sampled_relative_l2(a, b)[0] for a, b in zip(squares, norms, strict=True)]
             for name, squares in shown.items()
         }
         return {"frames": frames, "mean": {name: float(np.mean(values)) for name, values in frames.items()}}
