@@ -30,9 +30,9 @@ HALVES = 2  # of the reference, independent of each other: their product has no 
 def main() -> None:
     """Precompute, relight twice, render twice."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scene", default="bunny")
-    parser.add_argument("--lights", nargs=2, default=["sunset:90", "city:200"], help="NAME:DEGREES, twice")
-    parser.add_argument("--target-error", type=float, default=0.02)
+    parser.add_argument("--scene", default="spot")
+    parser.add_argument("--lights", nargs=2, default=["forest:216", "studio:0"], help="NAME:DEGREES, twice")
+    parser.add_argument("--target-error", type=float, default=0.01)
     parser.add_argument("--spp", type=int, default=1024, help="of each half of the reference")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--output", type=Path, default=ROOT / "images" / "hero.jpg")
