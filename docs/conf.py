@@ -12,7 +12,7 @@ import mi_sparse_prt  # noqa: E402
 
 project = "mi-sparse-prt"
 author = "the authors of mi-sparse-prt"
-project_copyright = "BSD-3-Clause"
+project_copyright = "the mi-sparse-prt authors, BSD-3-Clause"
 version = release = mi_sparse_prt.__version__
 
 extensions = [
@@ -24,6 +24,7 @@ extensions = [
 ]
 exclude_patterns = ["_ext", "Thumbs.db", "**/.ipynb_checkpoints"]
 nb_execution_mode = "off"
+nb_merge_streams = True
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 smartquotes = False  # --options stay what they are

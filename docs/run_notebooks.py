@@ -64,7 +64,8 @@ def small_png(encoded: str) -> str:
     if image.width > WIDEST:
         image = image.resize((WIDEST, image.height * WIDEST // image.width), Image.Resampling.LANCZOS)
     smaller = io.BytesIO()
-    image.quantize(COLOURS).save(smaller, "PNG", optimize=True)
+    palette = image.quantize(COLOURS)
+    image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(smaller, "PNG", optimize=True)
     return base64.b64encode(smaller.getvalue()).decode()
 
 

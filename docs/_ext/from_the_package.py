@@ -1,9 +1,11 @@
-"""Directives that read a page's text from the package itself, so that it cannot be older than the code."""
+"""Directives that read a page's text from the package and its notebooks, so that it cannot be older than these."""
 
 from __future__ import annotations
 
 import enum
 import inspect
+import json
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -15,6 +17,8 @@ from sphinx.util.nodes import nested_parse_with_titles
 
 import mi_sparse_prt.plugins
 from mi_sparse_prt.cli import app as command_line
+
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 
 
 class PluginManual(Directive):
@@ -31,6 +35,19 @@ class PluginManual(Directive):
         section.document = self.state.document
         nested_parse_with_titles(self.state, StringList(lines, source=f"docstring of {name}"), section)
         return section.children
+
+
+class NotebookPicture(Directive):
+    """``.. notebook-picture:: name number``: one of the pictures that a notebook stores."""
+
+    required_arguments = 2
+
+    def run(self) -> list[nodes.Node]:
+        name, number = self.arguments
+        notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text())
+        outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+        pictures = [o["data"]["image/png"] for o in outputs if "image/png" in o.get("data", {})]
+        return [nodes.image(uri=f"data:image/png;base64,{pictures[int(number)].strip()}", alt=name)]
 
 
 class Commands(Directive):
@@ -89,4 +106,5 @@ def setup(app: Sphinx) -> dict[str, object]:
     """Sphinx calls this."""
     app.add_directive("plugin-manual", PluginManual)
     app.add_directive("commands", Commands)
+    app.add_directive("notebook-picture", NotebookPicture)
     return {"parallel_read_safe": True}
