@@ -49,7 +49,7 @@ class Environment:
     report : dict
         `source`, `width`, `height`, and what the clamped values were: `negative_pixels` (pixels with a negative
         channel), `negative_pixel_share`, `negative_energy_share` (their part of the absolute energy: the sum of
-        |radiance| x solid angle over all channels).
+        absolute radiance x solid angle over all channels).
 
     Raises
     ------

@@ -14,7 +14,10 @@ from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
 
 
 class MeshVertices(mi.Sensor):
-    """Sensor ``mesh_vertices``: every pixel looks at one vertex of the scene's meshes.
+    r"""Vertex sensor (:monosp:`mesh_vertices`)
+    ----------------------------------------
+
+    Every pixel looks at one vertex of the scene's meshes.
 
     With any integrator, pixel ``i`` (row by row) is the radiance that leaves vertex ``i``, the vertices of all shapes
     counted in the order of ``scene.shapes()``. A vertex is seen from just above one of its triangles, a hundredth of
@@ -23,16 +26,17 @@ class MeshVertices(mi.Sensor):
     The rays are made when the sensor is bound to a loaded scene, because Mitsuba does not tell a sensor its scene:
     ``scene.sensors()[0].bind(scene)``. Rendering an unbound sensor is an error.
 
-    XML::
+    .. tabs::
+        .. code-tab:: xml
 
-        <sensor type="mesh_vertices">
-            <integer name="vertices" value="64075"/>
-            <sampler type="independent"><integer name="sample_count" value="64"/></sampler>
-        </sensor>
+            <sensor type="mesh_vertices">
+                <integer name="vertices" value="64075"/>
+                <sampler type="independent"><integer name="sample_count" value="64"/></sampler>
+            </sensor>
 
-    dict::
+        .. code-tab:: python
 
-        {"type": "mesh_vertices", "vertices": 64075, "sampler": {"type": "independent"}}
+            'type': 'mesh_vertices', 'vertices': 64075, 'sampler': {'type': 'independent'}
 
     ========== ========= ==================================================================================
     Parameter  Type      Meaning

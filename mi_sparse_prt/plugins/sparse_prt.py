@@ -16,26 +16,33 @@ from mi_sparse_prt.scene.scene import Scene
 
 
 class SparsePRT(mi.SamplingIntegrator):
-    """Integrator ``sparse_prt``: a scene lit by its environment through a precomputed light transport matrix.
+    r"""Precomputed light transport integrator (:monosp:`sparse_prt`)
+    --------------------------------------------------------------
+
+    A scene lit by its environment through a precomputed light transport matrix.
 
     On the first render of a scene its matrix is computed and kept in a cache; later renders, under whatever
     environment (``envmap``, ``constant``, ``cubemap``) and from whatever camera, only apply it. The camera sees the
     irradiance of the vertices, interpolated over triangles, times the albedo texture at the pixel. Emitters other than
     the environment do not take part.
 
-    XML::
+    .. tabs::
+        .. code-tab:: xml
 
-        <integrator type="sparse_prt">
-            <integer name="resolution" value="32"/>
-            <integer name="max_depth" value="5"/>
-            <float name="target_error" value="0.02"/>
-            <boolean name="reference" value="false"/>
-            <integrator type="path"><integer name="max_depth" value="5"/></integrator>
-        </integrator>
+            <integrator type="sparse_prt">
+                <integer name="resolution" value="32"/>
+                <integer name="max_depth" value="5"/>
+                <float name="target_error" value="0.02"/>
+                <boolean name="reference" value="false"/>
+                <integrator type="path"><integer name="max_depth" value="5"/></integrator>
+            </integrator>
 
-    dict::
+        .. code-tab:: python
 
-        {"type": "sparse_prt", "resolution": 32, "max_depth": 5, "reference_integrator": {"type": "path"}}
+            'type': 'sparse_prt',
+            'resolution': 32,
+            'max_depth': 5,
+            'reference_integrator': {'type': 'path'}
 
     =================== ========== =============================================================================
     Parameter           Type       Meaning

@@ -98,7 +98,7 @@ def test_windows_are_symmetric_as_the_cube_is(n):
     """
     grid = AngularGrid(prt.CubemapLighting(n))
     grid._sampled[:] = True
-    places = [grid._shifted(dx, dy) for dy in range(-3, 4) for dx in range(-3, 4)]
+    places = [grid._shift(dx, dy) for dy in range(-3, 4) for dx in range(-3, 4)]
     windows = [
         frozenset(int(t[j]) for t, inside in places if inside[j]) for j in range(grid.lighting.n_directions)
     ]

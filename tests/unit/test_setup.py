@@ -49,7 +49,7 @@ def fake_python(path: Path, python_version: str, exit_status: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("script", ["setup", "demo", "test", "run"])
+@pytest.mark.parametrize("script", ["setup", "demo", "docs", "test", "run"])
 def test_scripts_parse(script):
     subprocess.run(["bash", "-n", str(ROOT / ".ci" / script)], check=True)
 
