@@ -317,6 +317,10 @@ class LightTransport:
         PrtError
             If the folder does not exist or the file cannot be written (full disk, permissions).
         """
+        write_store(path, *self.stored())
+
+    def stored(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Attributes (JSON as it is) and arrays, as files have them (docs/file_format.md)."""
         attributes: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,
@@ -333,7 +337,7 @@ class LightTransport:
         for name, operator in self.operators.items():
             own_kinds, own = operator_arrays(operator, name)
             kinds, arrays = kinds | own_kinds, arrays | own
-        write_store(path, attributes | {"operators": kinds}, arrays)
+        return attributes | {"operators": kinds}, arrays
 
 
 GlossyTransport = LightTransport  # one class serves both

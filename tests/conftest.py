@@ -3,6 +3,7 @@
 Pure helpers are imported (``from conftest import diffuse``), what is expensive comes as session fixtures.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -12,6 +13,7 @@ import pytest
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.haar_rows import HaarRows
@@ -19,8 +21,9 @@ from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.transport import LightTransport, MeshRange
+from mi_sparse_prt.transport import LightTransport
 
 matplotlib.use("Agg")
 T = mi.ScalarTransform4f
@@ -158,17 +161,42 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
         ranks = (3,) if "grey" in form else (2, 3, 5)
         sides = [[rng.random(shape, np.float32) for shape in ((n_vertices, r), (r, m))] for r in ranks]
         indirect = LowRank(tuple(a for a, _ in sides), tuple(b for _, b in sides))
+    compressed = isinstance(direct, HaarRows | Clustered)
+    operators = {"compressed" if compressed else "direct": direct} | (
+        {"indirect": indirect} if indirect else {}
+    )
+    albedo, areas = rng.random((n_vertices, 3), dtype=np.float32), rng.random(n_vertices, dtype=np.float32)
+    keys = rng.integers(0, 1 << 63, n_vertices, dtype=np.uint64)
     return LightTransport(
-        lighting=lighting,
+        emission=lighting,
         basis="direction" if form.startswith("bits") else "texel",
-        albedo=rng.random((n_vertices, 3), dtype=np.float32),
-        areas=rng.random(n_vertices, dtype=np.float32),
-        direct=direct,
-        indirect=indirect,
-        meshes=(MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices))),
-        vertex_keys=rng.integers(0, 1 << 63, n_vertices, dtype=np.uint64),
+        measurement=Measurement(
+            keys, areas, (MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices)))
+        ),
+        reflection=Diffuse(albedo),
+        operators=operators,
         scene_hash="made up",
         report={"parameters": {"max_depth": 5}},
+    )
+
+
+def altered(transport: LightTransport, **changes: object) -> LightTransport:
+    """A matrix with other operators (None: without), points or reflectances, by short names."""
+    operators = dict(transport.operators)
+    for name in ("direct", "indirect"):
+        if name in changes:
+            operators[name] = changes.pop(name)
+    measured = {"areas": "areas", "vertex_keys": "keys", "meshes": "groups"}
+    measurement = {new: changes.pop(old) for old, new in measured.items() if old in changes}
+    if "albedo" in changes:
+        changes["reflection"] = Diffuse(changes.pop("albedo"))
+    if "lighting" in changes:
+        changes["emission"] = changes.pop("lighting")
+    return replace(
+        transport,
+        operators={name: operator for name, operator in operators.items() if operator is not None},
+        measurement=replace(transport.measurement, **measurement),
+        **changes,
     )
 
 

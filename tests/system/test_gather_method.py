@@ -9,7 +9,6 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.low_rank import LowRank
-from mi_sparse_prt.operators.single_elements import elements
 from mi_sparse_prt.solvers.paths import PathSolver
 
 LIGHTING = prt.CubemapLighting(8)
@@ -73,7 +72,7 @@ def test_rows_columns_and_relight_are_one_matrix(gathered):
     expected = np.einsum("njc,jc->nc", full, light)
     assert np.allclose(gathered.relight(light), expected, rtol=1e-5, atol=1e-5 * expected.max())
     ids, texels = np.array([0, 7, 7, 900]), np.array([0, 3, 383, 11])
-    single = elements(part, ids, texels)
+    single = part.elements(ids, texels)
     assert np.allclose(single, part.rows(ids)[np.arange(4), texels], rtol=1e-5, atol=1e-8)
 
 
@@ -85,7 +84,7 @@ def test_files_and_other_orders(tmp_path, scene, gathered):
         assert all(np.array_equal(a, b) for a, b in factors)
     assert again.report == gathered.report
     source = np.random.default_rng(0).permutation(gathered.shape[0])
-    turned = gathered.indirect.reordered(source)
+    turned = gathered.indirect.take(source)
     assert np.array_equal(turned.rows([3]), gathered.indirect.rows(source[[3]]))
 
 

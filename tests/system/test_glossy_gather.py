@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from conftest import T, build, diffuse
 from matplotlib.figure import Figure
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
+from mi_sparse_prt.precompute import precompute_glossy
 from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, FactorOptions, factor_cache
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
+from mi_sparse_prt.transport import LightTransport
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
@@ -100,18 +102,16 @@ class Compared:
 
 
 def compared(
-    seen: Scene, transport: GlossyTransport, vertices: np.ndarray, max_depth: int, spp: int
+    seen: Scene, transport: LightTransport, vertices: np.ndarray, max_depth: int, spp: int
 ) -> Compared:
     """Indirect light of some vertices, all glossy or all not, by paths in a scene whose vertices are the same."""
-    direct, points = transport.direct, vertex_points(seen)
-    halves = [
-        TermPaths(seen.normalised, direct, points, max_depth, spp, seed=10 + k).rows(vertices).mean
-        for k in range(2)
-    ]
+    reflection = transport.reflection
+    problem = Problem(seen, LIGHTING, mesh_vertices(seen), reflection, max_depth=max_depth)
+    assert problem.channels == 1
+    halves = [TermPaths(problem, spp, seed=10 + k).rows(vertices).mean for k in range(2)]
     rows = vertices[:, None]
-    if np.isin(vertices, direct.glossy).all():
-        terms = len(direct.bits) + TERMS * np.searchsorted(direct.glossy, rows) + np.arange(TERMS)
-        rows = np.concatenate([rows, terms], axis=1)
+    if np.isin(vertices, reflection.glossy).all():
+        rows = reflection.rows_of_each(vertices, 1 + TERMS)
     assert transport.indirect is not None
     found = transport.indirect.rows(rows.ravel())[..., 0].reshape(*rows.shape, -1)
     power = LIGHTING.solid_angles[:, None]
@@ -237,10 +237,12 @@ def test_a_brushed_wall_behind_a_floor(artefact, floor, max_depth):
         check(result, name)
 
 
-def _materials(scene: Scene, transport: GlossyTransport) -> list[mi.BSDF | None]:
+def _materials(scene: Scene, transport: LightTransport) -> list[mi.BSDF | None]:
     """What finite elements take each mesh's BSDF for, None if it is diffuse."""
-    numbers = [transport.material[mesh.vertices.start] for mesh in scene.meshes]
-    return [factored_bsdf(transport.factors[number]) if number >= 0 else None for number in numbers]
+    numbers = [transport.reflection.material[mesh.vertices.start] for mesh in scene.meshes]
+    return [
+        factored_bsdf(transport.reflection.factors[number]) if number >= 0 else None for number in numbers
+    ]
 
 
 def test_noise_of_rays_is_known() -> None:
@@ -257,7 +259,7 @@ def test_noise_of_rays_is_known() -> None:
     )
     n = scene.n_vertices
 
-    def bounce(rays: int, seed: int) -> GlossyTransport:
+    def bounce(rays: int, seed: int) -> LightTransport:
         return precompute_glossy(
             scene, LIGHTING, TERMS, max_depth=3, rays=rays, tolerance=1e-3, seed=seed, progress=False
         )
@@ -266,8 +268,8 @@ def test_noise_of_rays_is_known() -> None:
     exact = bounce(2048, 0).indirect.rows(np.arange(n))[..., 0]
     found = [t.indirect.rows(np.arange(n))[..., 0] for t in few]
     pairs = [np.linalg.norm(a - b) / np.sqrt(2) for k, a in enumerate(found) for b in found[:k]]
-    known = np.mean([t.report["noise_of_rays"] for t in few])
+    known = np.mean([t.report["radiosity"]["noise_of_rays"] for t in few])
     assert 0.5 * known < np.mean(pairs) / np.linalg.norm(exact) < 1.33 * known
     many = bounce(128, 0)
-    assert many.report["noise_of_rays"] < known / 2
-    assert max(few[0].report["ranks"]) < max(many.report["ranks"])
+    assert many.report["radiosity"]["noise_of_rays"] < known / 2
+    assert max(few[0].report["radiosity"]["ranks"]) < max(many.report["radiosity"]["ranks"])

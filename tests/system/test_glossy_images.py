@@ -6,10 +6,11 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
-from mi_sparse_prt.glossy import GlossyTransport, precompute_glossy
+from conftest import T, altered, build, diffuse
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.precompute import precompute_glossy
+from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.glossy_images import (
     CAUSES,
     DirectionLights,
@@ -60,11 +61,11 @@ def scene() -> prt.Scene:
 
 
 @pytest.fixture(scope="module")
-def transport(scene) -> GlossyTransport:
+def transport(scene) -> LightTransport:
     return precompute_glossy(scene, LIGHTING, progress=False)
 
 
-def validated(scene: prt.Scene, transport: GlossyTransport, **parameters: object) -> GlossyValidation:
+def validated(scene: prt.Scene, transport: LightTransport, **parameters: object) -> GlossyValidation:
     """Of the scene's own camera alone, unless told otherwise."""
     defaults = {"sensors": scene.mitsuba.sensors(), "spp": 256, "width": 40}
     return validate_glossy(scene, transport, **(defaults | parameters))
@@ -133,10 +134,10 @@ def test_another_order_of_shapes(scene, transport, good):
     old = np.searchsorted(transport.glossy, back[glossy])
     rows = np.concatenate([back, (n + old[:, None] * transport.terms + np.arange(transport.terms)).ravel()])
     names = ("albedo", "areas", "tangents", "normals", "material", "vertex_keys")
-    moved = replace(
+    moved = altered(
         transport,
-        direct=transport.direct.reordered(back),
-        indirect=transport.indirect.reordered(rows),
+        direct=transport.direct.take(back),
+        indirect=transport.indirect.take(rows),
         **{name: getattr(transport, name)[back] for name in names},
     )
     assert errors(validated(scene, moved)) == pytest.approx(errors(good), rel=1e-3, abs=1e-5)
@@ -144,7 +145,9 @@ def test_another_order_of_shapes(scene, transport, good):
 
 def test_turned_tangents_are_blamed_on_transport(scene, transport, good):
     """A frame turned by 90 degrees about the normal makes the brushed ball reflect across; the references stay."""
-    turned = replace(transport, tangents=np.cross(transport.normals, transport.tangents))
+    reflection = transport.reflection
+    across = replace(reflection, tangents=np.cross(reflection.normals, reflection.tangents))
+    turned = replace(transport, reflection=across)
     found, known = errors(validated(scene, turned), "glossy"), errors(good, "glossy")
     assert found["factorization"] == pytest.approx(known["factorization"], rel=1e-4)
     assert found["lighting"] == pytest.approx(known["lighting"], rel=1e-4, abs=1e-6)
@@ -164,7 +167,7 @@ def test_wrong_factors_are_blamed_on_factorization(scene, good):
 
 def test_missing_light_is_blamed_on_transport(scene, transport, good):
     """Without indirect light: an image that is a tenth darker at most is noticed."""
-    found = errors(validated(scene, replace(transport, indirect=None)))
+    found = errors(validated(scene, altered(transport, indirect=None)))
     assert errors(good)["transport"] < 0.04  # as above
     assert found["transport"] > 0.06
 

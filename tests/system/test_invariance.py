@@ -165,8 +165,8 @@ def rows_by_key(scene: prt.Scene, basis: str) -> tuple[np.ndarray, np.ndarray]:
     transport = prt.precompute(
         scene, COARSE, method="brute_force", basis=basis, spp=4, seed=7, progress=False
     )
-    order = np.argsort(transport.vertex_keys)
-    return transport.rows(order), transport.vertex_keys[order]
+    order = np.argsort(transport.measurement.keys)
+    return transport.rows(order), transport.measurement.keys[order]
 
 
 def shuffled(scene: prt.Scene, seed: int) -> prt.Scene:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import made_up
+from conftest import altered, made_up
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.compression import clustered_pca
@@ -47,9 +47,11 @@ def test_errors_are_those_of_the_rows(form: str, bases: int) -> None:
         assert report["error"][mesh.name] == pytest.approx(
             relative(ours[mesh.vertices], truth[mesh.vertices]), rel=2e-3
         )
-    scale = np.sqrt(transport.areas[:, None, None] / transport.lighting.solid_angles[None, :, None])
+    scale = np.sqrt(
+        transport.measurement.areas[:, None, None] / transport.lighting.solid_angles[None, :, None]
+    )
     every = np.arange(len(transport.albedo))
-    on_sphere = relative(compressed.white_rows(every) * scale, transport.white_rows(every) * scale)
+    on_sphere = relative(compressed.incident.rows(every) * scale, transport.incident.rows(every) * scale)
     assert report["error"]["on_sphere"]["total"] == pytest.approx(on_sphere, rel=2e-3)
     assert 0.05 < report["error"]["total"] < 1
     assert report["nbytes"] == compressed.nbytes
@@ -69,7 +71,7 @@ def test_factors_give_the_clusters_of_the_expanded_matrix() -> None:
     base = made_up("bits and full indirect", n=4, n_vertices=60)
     dense = made_up("bits and full indirect", n=4, n_vertices=12).indirect
     weights = scipy.sparse.random_array((60, 12), density=0.3, rng=rng, format="csr", dtype=np.float32)
-    transport = replace(base, indirect=Interpolated(dense, weights))
+    transport = altered(base, indirect=Interpolated(dense, weights))
     rows = mesh_rows(transport, replace(base.meshes[0], vertices=slice(0, 60)))
     explicit = rows.rows(np.arange(60))
     span = np.linalg.qr(explicit[:, 0].T)[0].T.astype(np.float32)
@@ -93,10 +95,10 @@ def test_a_target_error_is_met_with_no_more_than_it_needs(computed: LightTranspo
         found = matrix_errors(computed, compressed)
         assert found["total"] <= target
         assert compressed.report["compression"]["error"]["total"] == pytest.approx(found["total"], rel=1e-3)
-        part = compressed.direct
+        part = compressed.operators["compressed"]
         assert isinstance(part, Clustered)
         fewer = replace(part, coefficients=part.coefficients[:, :, :-1], bases=part.bases[:, :-1])
-        assert matrix_errors(computed, replace(compressed, direct=fewer))["total"] > target
+        assert matrix_errors(computed, altered(compressed, direct=fewer))["total"] > target
 
 
 def test_relighting_and_files(computed: LightTransport, tmp_path) -> None:
@@ -114,7 +116,7 @@ def test_relighting_and_files(computed: LightTransport, tmp_path) -> None:
 
 def test_a_coloured_scene_shares_clusters_among_channels() -> None:
     transport = made_up("bits and factored light")
-    part = prt.compress(transport, clusters=2, bases=5, progress=False).direct
+    part = prt.compress(transport, clusters=2, bases=5, progress=False).operators["compressed"]
     assert part.coefficients.shape == (50, 3, 5)
     assert len(part.labels) == 50
 
@@ -136,7 +138,7 @@ def test_black_and_equal_rows() -> None:
     bits[:20] = 0  # the first mesh is black
     bits[20:] = bits[20]
     normals = np.repeat(transport.direct.normals[:1], 50, axis=0)
-    transport = replace(transport, direct=replace(transport.direct, bits=bits, normals=normals))
+    transport = altered(transport, direct=replace(transport.direct, bits=bits, normals=normals))
     compressed = prt.compress(transport, clusters=5, bases=4, progress=False)
     assert relative(every_row(compressed), every_row(transport)) < 1e-3
     assert not compressed.rows(np.arange(20)).any()

@@ -10,7 +10,6 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.interpolated import Interpolated
-from mi_sparse_prt.operators.single_elements import elements
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -120,7 +119,7 @@ def test_no_light_leaks(scene, direct, basis):
 
 def elements_of(part, ids: np.ndarray) -> np.ndarray:
     n = LIGHTING.n_directions
-    return 0.8 * elements(part, np.repeat(ids, n), np.tile(np.arange(n), len(ids))).reshape(len(ids), n)
+    return 0.8 * part.elements(np.repeat(ids, n), np.tile(np.arange(n), len(ids))).reshape(len(ids), n)
 
 
 def test_errors_at_a_contact_shrink():
@@ -137,7 +136,7 @@ def test_errors_at_a_contact_shrink():
     true = paths.elements(*every, 0).mean.reshape(shape) * lighting.solid_angles
     direct = DirectSolver(scene.normalised, lighting, points)
     found = prt.precompute(scene, lighting, Plan("exact", "gather", 1024, 0.001), max_depth=3, progress=False)
-    ours = elements(found.indirect, *every).reshape(shape)
+    ours = found.indirect.elements(*every).reshape(shape)
     light = direct.elements(
         np.repeat(np.arange(scene.n_vertices), shape[1]), np.tile(np.arange(shape[1]), scene.n_vertices)
     ).reshape(-1, shape[1])

@@ -13,9 +13,10 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators import direct_columns as columns_module
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import first_bounce as bounce_module
@@ -251,7 +252,7 @@ def direct_parts(scene: Scene) -> dict:
     texel = DirectSolver(scene.normalised, lighting, points, "texel")
     n, rng = scene.n_vertices, np.random.default_rng(0)
     weights = scipy.sparse.random_array((n, 60), density=0.1, rng=rng, dtype=np.float32).tocsr()
-    dense = bits.reordered(np.sort(rng.choice(n, 60, replace=False)))
+    dense = bits.take(np.sort(rng.choice(n, 60, replace=False)))
     return {
         "bits": bits,
         "fixed point": MeanCosine(texel.rows(np.arange(n)), lighting),
@@ -265,7 +266,7 @@ def test_low_rank_and_rows_against_the_series(coloured_scene, kind, monkeypatch)
 
     96 random combinations know a norm within about 1 / sqrt(2 x 96) = 7%.
     """
-    monkeypatch.setattr(columns_module, "BLOCK", 250 * 30)
+    monkeypatch.setattr(ColumnBlocks.__init__, "__defaults__", (250 * 30,))
     direct = direct_parts(coloured_scene)[kind]
     gather = solver(coloured_scene, 4)
     white = gather.contacts.lit(direct).columns(np.arange(96))[..., 0]
@@ -295,7 +296,7 @@ def test_parts_of_the_result_agree(coloured_scene):
     assert np.abs(rows - columns).max() < 1e-6 * rows.max()
     lights = rng.random((96, 3), dtype=np.float32)
     assert relative(result.relight(lights), np.einsum("ijc,jc->ic", rows, lights)) < 1e-5
-    turned = result.reordered(np.arange(n)[::-1])
+    turned = result.take(np.arange(n)[::-1])
     assert np.array_equal(turned.rows(np.array([0])), result.rows(np.array([n - 1])))
     again = solver(coloured_scene, 4).indirect(visibility(coloured_scene), tolerance=0.1)
     assert np.array_equal(again.relight(lights), result.relight(lights))
@@ -326,10 +327,14 @@ def test_a_basis_has_an_end(coloured_scene, monkeypatch):
 
 
 @dataclass(frozen=True)
-class SomePart:
-    """A direct part that is none of those known by type."""
+class SomePart(Operator):
+    """A direct part with no more than every one must have."""
 
     part: Visibility
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.part.shape
 
     @property
     def nbytes(self) -> int:
@@ -338,11 +343,15 @@ class SomePart:
     def rows(self, ids: np.ndarray) -> np.ndarray:
         return self.part.rows(ids)
 
-    def columns(self, ids: np.ndarray) -> np.ndarray:
-        return self.part.columns(ids)
+    def take(self, ids: np.ndarray) -> Operator:
+        return SomePart(self.part.take(ids))
 
-    def relight(self, lighting: np.ndarray) -> np.ndarray:
-        return self.part.relight(lighting)
+    def arrays(self) -> dict:
+        return {"part": self.part}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict, lighting: prt.CubemapLighting) -> Operator:
+        return cls(arrays["part"])
 
 
 def test_any_part_will_do(coloured_scene):
@@ -394,7 +403,7 @@ def test_nothing_to_gather(why, monkeypatch):
     shapes |= {"ground": {"type": "rectangle", "bsdf": black}} if why == "direct only" else {}
     scene = build(**shapes)
     gather, direct = solver(scene, 4, max_depth=2 if why == "direct only" else 5), visibility(scene)
-    monkeypatch.setattr(columns_module.DirectColumns, "combined", None)  # D is not touched
+    monkeypatch.setattr(bounce_module, "random_combinations", None)  # D is not touched
     result = gather.indirect(direct)
     assert result.ranks == (0,)
     assert result.bounces == 0

@@ -4,13 +4,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import build, diffuse
-from mi_sparse_prt.glossy import GlossyTransport
-from mi_sparse_prt.operators.direct_columns import DirectColumns
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 BRUSHED = {
     "type": "ashikhmin_shirley",
@@ -33,30 +32,31 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def glossy(scene: Scene) -> GlossyTransport:
+def glossy(scene: Scene) -> LightTransport:
     return prt.precompute_glossy(scene, prt.CubemapLighting(8), terms=3, progress=False)
 
 
 @pytest.fixture(scope="module")
-def coarse(scene: Scene) -> GlossyTransport:
+def coarse(scene: Scene) -> LightTransport:
     """Of so few directions that a basis of all is small."""
     return prt.precompute_glossy(scene, prt.CubemapLighting(2), terms=3, progress=False)
 
 
-def every_row(glossy: GlossyTransport) -> np.ndarray:
-    return glossy.white_rows(np.arange(glossy.direct.count))
+def every_row(glossy: LightTransport) -> np.ndarray:
+    return glossy.incident.rows(np.arange(glossy.direct.shape[0]))
 
 
-def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: GlossyTransport) -> None:
+def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: LightTransport) -> None:
     """In the frame of each vertex; the table costs next to nothing."""
-    direct, lighting = glossy.direct, glossy.lighting
-    rows = direct.rows(np.arange(direct.count))[..., 0]
-    turn = frames(glossy.tangents, glossy.normals)
+    direct, lighting, reflection = glossy.direct, glossy.lighting, glossy.reflection
+    rows = direct.rows(np.arange(direct.shape[0]))[..., 0]
+    turn = frames(reflection.tangents, reflection.normals)
     for i in range(0, len(direct.glossy), 37):
         v = direct.glossy[i]
         local = lighting.directions @ turn[v].T
         seen = rows[v] > 0  # above the horizon and not blocked
-        f = glossy.factors[0].grid.interpolate(glossy.factors[0].incident, local)
+        factors = reflection.factors[0]
+        f = factors.grid.interpolate(factors.incident, local)
         expected = f * seen * lighting.solid_angles
         found = rows[scene.n_vertices + 3 * i : scene.n_vertices + 3 * (i + 1)]
         high = local[:, 2] > 0.1
@@ -66,47 +66,45 @@ def test_direct_terms_are_factors_times_visibility(scene: Scene, glossy: GlossyT
         np.testing.assert_allclose(gain, 1, atol=4e-3)
 
 
-def test_all_ways_to_ask_agree(glossy: GlossyTransport) -> None:
+def test_all_ways_to_ask_agree(glossy: LightTransport) -> None:
     direct, lighting = glossy.direct, glossy.lighting
     rng = np.random.default_rng(0)
-    every = direct.rows(np.arange(direct.count))
-    ids, texels = rng.permutation(direct.count)[:40], rng.permutation(lighting.n_directions)[:10]
+    every = direct.rows(np.arange(direct.shape[0]))
+    ids, texels = rng.permutation(direct.shape[0])[:40], rng.permutation(lighting.n_directions)[:10]
     light = rng.random((lighting.n_directions, 3)).astype(np.float32)
     np.testing.assert_array_equal(direct.rows(ids), every[ids])
     np.testing.assert_allclose(direct.columns(texels), every[:, texels], atol=1e-7)
     np.testing.assert_allclose(direct.relight(light), every[..., 0] @ light, atol=1e-5)
-    np.testing.assert_allclose(direct.project(light)[..., 0], every[..., 0] @ light, atol=1e-5)
-    few, place = direct.with_rows(ids)
-    np.testing.assert_array_equal(few.rows(np.arange(few.count))[place], every[ids])
-    np.testing.assert_allclose(
-        DirectColumns(direct, lighting, ids).at(texels), every[ids][:, texels, 0], atol=1e-7
-    )
+    np.testing.assert_allclose(direct.apply(light)[:, 0], every[..., 0] @ light, atol=1e-5)
+    few = direct.take(ids)
+    np.testing.assert_array_equal(few.rows(np.arange(len(ids))), every[ids])
+    np.testing.assert_allclose(ColumnBlocks(few).at(texels), every[ids][:, texels, 0], atol=1e-7)
     words, signs = np.array([1, 5]), rng.choice(np.array([-1, 1], np.float32), (2, 32))
-    sums = sum(
-        every[len(direct.bits) :, 32 * w : 32 * w + 32, 0] * s for w, s in zip(words, signs, strict=True)
-    )
+    sums = sum(every[:, 32 * w : 32 * w + 32, 0] * s for w, s in zip(words, signs, strict=True))
     np.testing.assert_allclose(direct.combined(words, signs), sums, atol=1e-6)
 
 
-def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: GlossyTransport) -> None:
+def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: LightTransport) -> None:
     light = np.random.default_rng(1).random((glossy.lighting.n_directions, 3)).astype(np.float32)
     rows = every_row(glossy)
     found = glossy.coefficients(light)
     b = np.einsum("ijc,jd->id", rows, light)  # grey: one channel
     np.testing.assert_allclose(found.white, b[: scene.n_vertices], rtol=1e-3, atol=1e-5)
     terms = b[scene.n_vertices :].reshape(-1, 3, 3)
-    np.testing.assert_allclose(found.terms[glossy.glossy], terms, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found.terms[glossy.reflection.glossy], terms, rtol=1e-3, atol=1e-5)
     up = np.array([0.0, 1.0, 0.0])
     radiance = glossy.relight(light, up)
-    v = glossy.glossy[np.argmax(scene.normals[glossy.glossy, 1])]  # the top of the ball
-    local = (frames(glossy.tangents, glossy.normals)[v] @ up).astype(np.float32)
-    g = glossy.factors[0].grid.interpolate(glossy.factors[0].outgoing, local[None])[:, 0, 0]
+    reflection = glossy.reflection
+    v = reflection.glossy[np.argmax(scene.normals[reflection.glossy, 1])]  # the top of the ball
+    local = (frames(reflection.tangents, reflection.normals)[v] @ up).astype(np.float32)
+    factors = reflection.factors[0]
+    g = factors.grid.interpolate(factors.outgoing, local[None])[:, 0, 0]
     expected = glossy.albedo[v] * found.white[v] + g @ found.terms[v]
     np.testing.assert_allclose(radiance[v], expected, rtol=1e-4)
     assert not radiance[scene.normals[:, 1] < -0.01].any()
 
 
-def test_terms_take_either_sign(glossy: GlossyTransport) -> None:
+def test_terms_take_either_sign(glossy: LightTransport) -> None:
     rows = every_row(glossy)[len(glossy.albedo) :]
     assert (rows < -0.01 * rows.max()).any()
 
@@ -117,11 +115,11 @@ def test_without_indirect_light(scene: Scene) -> None:
     assert "gather" not in direct.report["rays"]
 
 
-def test_rows_of_a_vertex_share_its_cluster(scene: Scene, glossy: GlossyTransport) -> None:
+def test_rows_of_a_vertex_share_its_cluster(scene: Scene, glossy: LightTransport) -> None:
     small = prt.compress(glossy, clusters=3, bases=16, progress=False)
-    labels = small.direct.labels
+    labels = small.operators["compressed"].labels
     per_vertex = labels[scene.n_vertices :].reshape(-1, 3)
-    np.testing.assert_array_equal(per_vertex, labels[glossy.glossy][:, None].repeat(3, axis=1))
+    np.testing.assert_array_equal(per_vertex, labels[glossy.reflection.glossy][:, None].repeat(3, axis=1))
     light = np.random.default_rng(1).random((glossy.lighting.n_directions, 3)).astype(np.float32)
     toward = np.array([0.3, 1.0, 0.4])
     ours, truth = (t.relight(light, toward) for t in (small, glossy))
@@ -129,7 +127,7 @@ def test_rows_of_a_vertex_share_its_cluster(scene: Scene, glossy: GlossyTranspor
     assert small.report["compression"]["error"]["total"] < 0.2
 
 
-def test_a_compressed_transport_is_rendered(scene: Scene, coarse: GlossyTransport) -> None:
+def test_a_compressed_transport_is_rendered(scene: Scene, coarse: LightTransport) -> None:
     """With all basis vectors there are it is the same picture, but for 16 bits."""
     sensor = mi.load_dict(
         {
@@ -152,7 +150,7 @@ def test_arguments_that_make_no_sense(scene: Scene, arguments: dict, said: str) 
         prt.precompute_glossy(scene, prt.CubemapLighting(4), **arguments)
 
 
-def test_what_it_is_not_for(grey_scene: Scene, glossy: GlossyTransport) -> None:
+def test_what_it_is_not_for(grey_scene: Scene, glossy: LightTransport) -> None:
     with pytest.raises(prt.PrtError, match="no surface"):
         prt.precompute_glossy(grey_scene, prt.CubemapLighting(4), progress=False)
     with pytest.raises(prt.PrtError, match="haar"):

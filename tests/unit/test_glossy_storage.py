@@ -8,7 +8,7 @@ import pytest
 from conftest import build, diffuse
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.cache import cached_glossy
+from mi_sparse_prt.cache import cached_precompute
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -41,16 +41,16 @@ def scene() -> prt.Scene:
 
 
 @pytest.fixture(scope="module")
-def glossy(scene) -> prt.GlossyTransport:
+def glossy(scene) -> prt.LightTransport:
     return prt.precompute_glossy(scene, LIGHTING, terms=2, progress=False)
 
 
 @pytest.fixture(scope="module")
-def forms(glossy) -> dict[str, prt.GlossyTransport]:
+def forms(glossy) -> dict[str, prt.LightTransport]:
     return {"bits": glossy, "clusters": prt.compress(glossy, clusters=2, bases=4, progress=False)}
 
 
-def radiance(transport: prt.GlossyTransport) -> np.ndarray:
+def radiance(transport: prt.LightTransport) -> np.ndarray:
     return transport.relight(LIGHT, [0.3, 1.0, 0.5])
 
 
@@ -58,7 +58,7 @@ def radiance(transport: prt.GlossyTransport) -> np.ndarray:
 def test_round_trip(tmp_path, scene, forms, form):
     forms[form].save(tmp_path / "a.prt")
     loaded = prt.load_transport(tmp_path / "a.prt", scene)
-    assert isinstance(loaded, prt.GlossyTransport)
+    assert isinstance(loaded, prt.LightTransport) and loaded.terms == 2
     assert np.array_equal(radiance(loaded), radiance(forms[form]))
     assert loaded.report == forms[form].report
     assert [p.name for p in tmp_path.iterdir()] == ["a.prt"]
@@ -73,7 +73,7 @@ def test_another_order_of_shapes(scene, forms, form):
     other = scene_of(PHONG, backwards=True)
     assert not np.allclose(other.positions, scene.positions)
     moved = forms[form].for_scene(other)
-    place = [int(np.flatnonzero(moved.vertex_keys == key)[0]) for key in forms[form].vertex_keys]
+    place = [int(np.flatnonzero(moved.measurement.keys == key)[0]) for key in forms[form].measurement.keys]
     np.testing.assert_allclose(other.positions[place], scene.positions, atol=1e-6)
     np.testing.assert_allclose(radiance(moved)[place], radiance(forms[form]), rtol=2e-6, atol=1e-6)
     assert moved.for_scene(scene).meshes == forms[form].meshes
@@ -83,15 +83,15 @@ def test_another_order_of_shapes(scene, forms, form):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda t: {"material": t.material + 1},
-        lambda t: {"material": np.full_like(t.material, -2)},
-        lambda t: {"tangents": t.tangents[1:]},
-        lambda t: {"direct": replace(t.direct, materials=t.direct.materials + 1)},
-        lambda t: {"direct": replace(t.direct, tables=t.direct.tables[..., :1])},
-        lambda t: {"direct": replace(t.direct, bits=t.direct.bits[1:])},
-        lambda t: {"factors": (replace(t.factors[0], incident=t.factors[0].incident[:, 1:]),)},
-        lambda t: {"factors": (t.factors[0].first(1),)},
-        lambda t: {"factors": ()},
+        lambda r, d: ({"material": r.material + 1}, {}),
+        lambda r, d: ({"material": np.full_like(r.material, -2)}, {}),
+        lambda r, d: ({"tangents": r.tangents[1:]}, {}),
+        lambda r, d: ({}, {"material": d.material + 1}),
+        lambda r, d: ({}, {"tables": d.tables[..., :1]}),
+        lambda r, d: ({}, {"visibility": replace(d.visibility, bits=d.visibility.bits[1:])}),
+        lambda r, d: ({"factors": (replace(r.factors[0], incident=r.factors[0].incident[:, 1:]),)}, {}),
+        lambda r, d: ({"factors": (r.factors[0].first(1),)}, {}),
+        lambda r, d: ({"factors": ()}, {}),
     ],
     ids=[
         "no such BRDF",
@@ -107,26 +107,31 @@ def test_another_order_of_shapes(scene, forms, form):
 )
 def test_parts_that_do_not_fit_are_refused(tmp_path, glossy, change):
     """A file that was spliced would read beyond its arrays."""
-    replace(glossy, **change(glossy)).save(tmp_path / "a.prt")
+    of_reflection, of_direct = change(glossy.reflection, glossy.direct)
+    replace(
+        glossy,
+        reflection=replace(glossy.reflection, **of_reflection),
+        operators={**glossy.operators, "direct": replace(glossy.direct, **of_direct)},
+    ).save(tmp_path / "a.prt")
     with pytest.raises(prt.PrtError, match="damaged") as error:
         prt.load_transport(tmp_path / "a.prt")
     assert "\n" not in str(error.value)
 
 
 def test_the_cache_finds_it_again(tmp_path, scene, monkeypatch):
-    made = cached_glossy(scene, LIGHTING, tmp_path, False, terms=2, max_depth=2)
-    monkeypatch.setattr("mi_sparse_prt.cache.precompute_glossy", None)
-    found = cached_glossy(scene, LIGHTING, tmp_path, False, terms=2, max_depth=2)
+    made = cached_precompute(scene, LIGHTING, tmp_path, False, terms=2, max_depth=2)
+    monkeypatch.setattr("mi_sparse_prt.cache.precompute", None)
+    found = cached_precompute(scene, LIGHTING, tmp_path, False, terms=2, max_depth=2)
     assert np.array_equal(radiance(found), radiance(made))
     with pytest.raises(TypeError):  # other settings, another matrix
-        cached_glossy(scene, LIGHTING, tmp_path, False, terms=3, max_depth=2)
+        cached_precompute(scene, LIGHTING, tmp_path, False, terms=3, max_depth=2)
 
 
 # ------------------------------------------------------------------------------------ a BSDF chosen later
 
 
 @pytest.fixture(scope="module")
-def general(scene) -> prt.GlossyTransport:
+def general(scene) -> prt.LightTransport:
     return prt.precompute_glossy(scene, LIGHTING, harmonics=3, max_depth=2, progress=False)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import FORMS, made_up
+from conftest import FORMS, altered, made_up
 from tqdm.auto import tqdm
 
 import mi_sparse_prt as prt
@@ -37,13 +37,13 @@ def smooth(n: int = 8, n_vertices: int = 40, seed: int = 3) -> LightTransport:
     base = made_up("fixed point", n, n_vertices)
     seen = np.maximum(rng.normal(size=(n_vertices, 3)) @ base.lighting.directions.T, 0)
     fixed = (65535 * seen / seen.max()).astype(np.uint16)
-    return replace(base, direct=MeanCosine(fixed, base.lighting), areas=np.ones(n_vertices, np.float32))
+    return altered(base, direct=MeanCosine(fixed, base.lighting), areas=np.ones(n_vertices, np.float32))
 
 
 def on_sphere(transport: LightTransport, part: HaarRows | None = None) -> np.ndarray:
     """White rows (n_v, channels, m) in the norm of the sphere."""
     ids = np.arange(len(transport.albedo))
-    white = transport.white_rows(ids) if part is None else part.rows(ids)
+    white = transport.incident.rows(ids) if part is None else part.rows(ids)
     return np.moveaxis(white, 2, 1).astype(np.float64) / np.sqrt(transport.lighting.solid_angles)
 
 
@@ -129,9 +129,9 @@ def test_rows_keep_what_they_promise(form: str, target: float) -> None:
 
 def test_the_error_is_the_energy_left_out() -> None:
     """On the sphere by its numbers; of T against both matrices, made explicit."""
-    transport = replace(smooth(), areas=np.random.default_rng(5).random(40).astype(np.float32))
+    transport = altered(smooth(), areas=np.random.default_rng(5).random(40).astype(np.float32))
     part, report = haar_part(transport, 0.05, progress=False)
-    other = replace(transport, direct=part, indirect=None)
+    other = altered(transport, direct=part, indirect=None)
     for mesh in transport.meshes:
         left_out = 1 - report["kept_energy"][mesh.name]
         assert report["error"]["on_sphere"][mesh.name] ** 2 == pytest.approx(left_out, rel=ROUNDED)
@@ -140,7 +140,7 @@ def test_the_error_is_the_energy_left_out() -> None:
         error = np.linalg.norm(away) / np.linalg.norm(exact)
         assert report["error"][mesh.name] == pytest.approx(error, rel=ROUNDED)
     away, exact = squares(on_sphere(transport, part) - on_sphere(transport)), squares(on_sphere(transport))
-    total = np.sqrt(transport.areas @ away[:, 0] / (transport.areas @ exact[:, 0]))
+    total = np.sqrt(transport.measurement.areas @ away[:, 0] / (transport.measurement.areas @ exact[:, 0]))
     assert report["error"]["on_sphere"]["total"] == pytest.approx(total, rel=ROUNDED)
     assert report["error"]["on_sphere"]["total"] <= 0.05
 
@@ -168,7 +168,7 @@ def test_all_ways_to_use_the_part_are_one_matrix(form: str) -> None:
     m = transport.lighting.n_directions
     rows = part.rows(np.arange(50))
     assert rows.dtype == np.float32
-    assert rows.shape == transport.white_rows(np.arange(50)).shape
+    assert rows.shape == transport.incident.rows(np.arange(50)).shape
     columns = rng.integers(0, m, 7)
     assert close(part.columns(columns), rows[:, columns])
     light = rng.normal(size=(m, 3)).astype(np.float32)
@@ -176,9 +176,9 @@ def test_all_ways_to_use_the_part_are_one_matrix(form: str) -> None:
     assert close(part.relight(light), np.einsum("vmc,mc->vc", channels, light))
     for k in (1, 3, 5):
         vectors = rng.normal(size=(m, k)).astype(np.float32)
-        assert close(part.project(vectors), np.einsum("vmc,mk->vkc", rows.astype(np.float64), vectors))
+        assert close(part.apply(vectors), np.einsum("vmc,mk->vck", rows.astype(np.float64), vectors))
     source = rng.permutation(50)[:20]
-    assert close(part.reordered(source).rows(np.arange(20)), rows[source])
+    assert close(part.take(source).rows(np.arange(20)), rows[source])
     assert close(part.rows(source), rows[source])
 
 
@@ -186,7 +186,7 @@ def test_a_matrix_with_the_part_relights() -> None:
     """Within the bound that the error of the rows sets."""
     transport = made_up("bits and factored light")
     part, report = haar_part(transport, 0.02, progress=False)
-    small = replace(transport, direct=part, indirect=None)
+    small = altered(transport, direct=part, indirect=None)
     light = np.random.default_rng(7).random((96, 3), dtype=np.float32)
     bound = 0.02 * np.sqrt(squares(on_sphere(transport)) * ((light**2).T @ transport.lighting.solid_angles))
     assert (np.abs(small.irradiance(light) - transport.irradiance(light)) <= 1.001 * bound).all()
@@ -204,7 +204,7 @@ def test_black_rows_have_no_coefficients() -> None:
     transport = smooth()
     fixed = transport.direct.fixed.copy()
     fixed[:25] = 0  # all of the first mesh
-    transport = replace(transport, direct=MeanCosine(fixed, transport.lighting))
+    transport = altered(transport, direct=MeanCosine(fixed, transport.lighting))
     part, report = haar_part(transport, 0.05, progress=False)
     assert part.starts[25] == 0
     assert not part.rows(np.arange(25)).any()
@@ -216,7 +216,7 @@ def test_black_rows_have_no_coefficients() -> None:
 def test_equal_rows_stay_equal() -> None:
     transport = smooth()
     fixed = np.repeat(transport.direct.fixed[:1], 40, axis=0)
-    part, _ = haar_part(replace(transport, direct=MeanCosine(fixed, transport.lighting)), 0.05, False)
+    part, _ = haar_part(altered(transport, direct=MeanCosine(fixed, transport.lighting)), 0.05, False)
     rows = part.rows(np.arange(40))
     np.testing.assert_array_equal(rows, np.repeat(rows[:1], 40, axis=0))
 
@@ -225,7 +225,7 @@ def test_equal_rows_stay_equal() -> None:
 def test_tiny_cubemaps(n: int) -> None:
     transport = made_up("fixed point and factored grey light", n)
     part, report = haar_part(transport, 0.001, progress=False)
-    assert close_to(part.rows(np.arange(50)), transport.white_rows(np.arange(50)), 0.005)
+    assert close_to(part.rows(np.arange(50)), transport.incident.rows(np.arange(50)), 0.005)
     assert report["error"]["total"] <= 0.002
 
 
@@ -238,7 +238,7 @@ def test_dark_scenes_lose_no_digits() -> None:
     base = made_up("fixed point and factored grey light")
     factors = base.indirect
     dark = replace(factors, left=(factors.left[0] * np.float32(1e-12),))
-    dim = replace(base, direct=MeanCosine(np.zeros_like(base.direct.fixed), base.lighting), indirect=dark)
+    dim = altered(base, direct=MeanCosine(np.zeros_like(base.direct.fixed), base.lighting), indirect=dark)
     _, report = haar_part(dim, 0.001, progress=False)
     assert 0 < report["error"]["on_sphere"]["total"] <= 0.001
 
@@ -249,7 +249,7 @@ def test_large_cubemaps_have_wide_places() -> None:
     fixed = np.zeros((2, lighting.n_directions), np.uint16)
     fixed[:, -5:] = 60000
     base = made_up("fixed point", 1, 2)
-    transport = replace(
+    transport = altered(
         base, lighting=lighting, direct=MeanCosine(fixed, lighting), meshes=(MeshRange("a", slice(0, 2)),)
     )
     part, report = haar_part(transport, 0.01, progress=False)
@@ -262,7 +262,7 @@ def test_the_entry(tmp_path) -> None:
     transport = made_up("bits and factored light")
     small = compress(transport, method="haar", target_error=0.1, progress=False)
     part, report = haar_part(transport, 0.1, progress=False)
-    np.testing.assert_array_equal(small.direct.values, part.values)
+    np.testing.assert_array_equal(small.operators["compressed"].values, part.values)
     assert small.indirect is None
     assert small.report["compression"]["error"] == report["error"]
     assert small.report["compression"]["method"] == "haar"

@@ -6,23 +6,39 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import FORMS, T, build, bumpy_ball, diffuse, made_up, still_life
+from conftest import FORMS, T, altered, build, bumpy_ball, diffuse, made_up, still_life
 from conftest import mesh as mesh_of
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.estimation import element_sampling, held_out
 from mi_sparse_prt.estimation.element_sampling import for_direct_light, for_indirect_light
-from mi_sparse_prt.estimation.held_out import Sample, held_out_error, relative
+from mi_sparse_prt.estimation.held_out import Sample, relative
+from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.operators.single_elements import elements
 from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.solvers.direct_rays import BITS
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
 LIGHTING = prt.CubemapLighting(4)
 SEEDS = range(6)
+
+
+def held_out_error(
+    scene: prt.Scene, transport: LightTransport, max_depth: int, seed: int, target: float | None = None
+) -> dict:
+    """Of a matrix of diffuse vertices."""
+    points, surfaces = mesh_vertices(scene), Diffuse(scene.albedo)
+    problem = Problem(scene, transport.emission, points, surfaces, transport.basis, max_depth)
+    return held_out.held_out_error(problem, transport, seed, target)
+
+
+def row_sample(weights: np.ndarray, squares: np.ndarray, norms: np.ndarray) -> Sample:
+    """Of one quantity."""
+    return Sample(weights, np.asarray(squares)[:, None], np.asarray(norms)[:, None])
 
 
 @cache
@@ -76,7 +92,7 @@ def exact() -> tuple[prt.Scene, LightTransport]:
 
 
 def with_bits(transport: LightTransport, bits: np.ndarray) -> LightTransport:
-    return replace(transport, direct=replace(transport.direct, bits=bits))
+    return altered(transport, direct=replace(transport.direct, bits=bits))
 
 
 def flipped(transport: LightTransport, one_of: int, seed: int) -> LightTransport:
@@ -274,7 +290,7 @@ def test_errors_in_proportion_need_no_interval():
     rng = np.random.default_rng(0)
     norms, weights = rng.exponential(size=100), 1 + rng.random(100)
     samples = [
-        Sample(weights[part], 0.01 * norms[part], norms[part]) for part in np.split(np.arange(100), [60])
+        row_sample(weights[part], 0.01 * norms[part], norms[part]) for part in np.split(np.arange(100), [60])
     ]
     found, error = relative(samples)
     assert found == pytest.approx(0.1)
@@ -293,7 +309,7 @@ def test_the_spread_is_that_of_many_draws():
     draws = []
     for _ in range(400):
         drawn = rng.random(4000) < chances
-        draws.append(relative([Sample(1 / chances[drawn], squares[drawn], norms[drawn])]))
+        draws.append(relative([row_sample(1 / chances[drawn], squares[drawn], norms[drawn])]))
     found, errors = np.transpose(draws)
     true = np.sqrt(squares.sum() / norms.sum())
     assert found.mean() == pytest.approx(true, rel=0.01)
@@ -303,8 +319,8 @@ def test_the_spread_is_that_of_many_draws():
 
 def test_parts_with_elements_of_their_own():
     """Two sums over the same matrix, of elements drawn apart, are added: 0.03 + 0.01 over 1."""
-    direct = Sample(np.full(50, 2.0), np.full(50, 0.03), np.full(50, 0.9))
-    indirect = Sample(np.full(10, 10.0), np.full(10, 0.01), np.full(10, 0.1))
+    direct = row_sample(np.full(50, 2.0), np.full(50, 0.03), np.full(50, 0.9))
+    indirect = row_sample(np.full(10, 10.0), np.full(10, 0.01), np.full(10, 0.1))
     assert relative([direct, indirect])[0] == pytest.approx(0.2)
 
 
@@ -313,15 +329,15 @@ def test_where_nothing_is_wrong_one_element_may_be(n):
     """Of n equal elements one, had it been wrong, would be a relative error of sqrt(1 / n). Dark ones do not count."""
     norms = np.zeros(n)
     norms[: n // 2] = 3.0
-    found, error = relative([Sample(np.full(n, 7.0), np.zeros(n), norms)])
+    found, error = relative([row_sample(np.full(n, 7.0), np.zeros(n), norms)])
     assert found == 0
     assert error == pytest.approx(np.sqrt(2 / n))
 
 
 def test_a_black_mesh_has_no_error():
     black, ones = np.zeros(5), np.ones(5)
-    assert relative([Sample(ones, black, black)]) == (0.0, 0.0)
-    assert relative([Sample(ones, ones, black)]) == (1.0, 0.0)
+    assert relative([row_sample(ones, black, black)]) == (0.0, 0.0)
+    assert relative([row_sample(ones, ones, black)]) == (1.0, 0.0)
 
 
 def test_a_black_mesh_among_others():
@@ -415,13 +431,13 @@ def test_elements_are_those_of_rows(form):
     rng = np.random.default_rng(0)
     n, n_directions = transport.shape[:2]
     ids, texels = rng.integers(n, size=300), rng.integers(n_directions, size=300)
-    parts = [transport.direct] + ([transport.indirect] if transport.indirect else [])
+    parts = list(transport.operators.values())
     weights = scipy.sparse.random_array((n, n), density=0.1, format="csr", rng=rng, dtype=np.float32)
     parts += [Interpolated(part, weights) for part in parts if not isinstance(part, MeanCosine)]
     for part in parts:
         rows = part.rows(ids)[np.arange(300), texels]
-        assert np.allclose(elements(part, ids, texels), rows, rtol=1e-5, atol=1e-7 * np.abs(rows).max())
-        assert elements(part, ids[:0], texels[:0]).shape == (0, rows.shape[1])
+        assert np.allclose(part.elements(ids, texels), rows, rtol=1e-5, atol=1e-7 * np.abs(rows).max())
+        assert part.elements(ids[:0], texels[:0]).shape == (0, rows.shape[1])
 
 
 # ------------------------------------------------------------------------------------ method "sparse"

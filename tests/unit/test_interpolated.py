@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import made_up
+from conftest import altered, made_up
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt import storage
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.transport import LightTransport
@@ -38,7 +37,7 @@ def interpolated(form: str, n: int = N, n_dense: int = N_DENSE) -> LightTranspor
     """A made-up matrix of 50 vertices with parts that are interpolated from 12 dense vertices."""
     kind = "bits" if form == "direct" else "bits and coarse indirect"
     few, all_ = (made_up(kind, n, k) for k in (n_dense, N_V))
-    return replace(
+    return altered(
         all_,
         direct=all_.direct if form == "indirect" else Interpolated(few.direct, some_weights(N_V, n_dense)),
         indirect=few.indirect and Interpolated(few.indirect, some_weights(N_V, n_dense, 1)),
@@ -142,7 +141,7 @@ def test_other_orders(transport, full):
     order = np.random.default_rng(2).permutation(N_V)
     for part in (transport.direct, transport.indirect):
         if isinstance(part, Interpolated):
-            turned, L = part.reordered(order), full[0].astype(np.float32)
+            turned, L = part.take(order), full[0].astype(np.float32)
             assert turned.dense is part.dense
             assert np.array_equal(turned.rows(np.arange(N_V)), part.rows(order))
             assert np.array_equal(turned.columns([5, 7]), part.columns([5, 7])[order])
@@ -161,7 +160,7 @@ def test_bytes_are_those_of_the_factors():
 
 
 def assert_same(a: LightTransport, b: LightTransport) -> None:
-    factors = [storage._arrays(t) for t in (a, b)]
+    factors = [t.stored()[1] for t in (a, b)]
     assert factors[0].keys() == factors[1].keys()
     for name, array in factors[0].items():
         assert array.dtype == factors[1][name].dtype, name
@@ -217,25 +216,27 @@ def spliced(tmp_path: Path, arrays: tuple[str, ...], other: LightTransport) -> P
 
 
 def test_splicing_alone_does_no_damage(tmp_path):
-    path = spliced(tmp_path, ("albedo", "weights_direct_data", "indirect"), interpolated("both"))
+    path = spliced(
+        tmp_path, ("reflection.albedo", "direct.weights_data", "indirect.dense.density"), interpolated("both")
+    )
     assert_same(prt.load_transport(path), interpolated("both"))
 
 
 @pytest.mark.parametrize(
     "array",
     [
-        "visibility",
-        "normals",
-        "weights_direct_data",
-        "weights_direct_indices",
-        "weights_indirect_data",
-        "weights_indirect_indices",
+        "direct.dense.visibility",
+        "direct.dense.normals",
+        "direct.weights_data",
+        "direct.weights_indices",
+        "indirect.weights_data",
+        "indirect.weights_indices",
     ],
 )
 def test_damaged_shapes_are_refused(tmp_path, array):
     """One array of a matrix with other numbers of dense vertices and of weights."""
     good, other = interpolated("both"), interpolated("both", n_dense=30)
-    assert array in storage._arrays(good)
+    assert array in good.stored()[1]
     assert good.direct.weights.nnz != other.direct.weights.nnz
     assert good.indirect.weights.nnz != other.indirect.weights.nnz
     with pytest.raises(prt.PrtError, match="damaged") as error:
@@ -248,10 +249,10 @@ def test_weights_with_rows_for_other_vertices_are_refused(tmp_path, part):
     """All three arrays of the weights, consistent in themselves, but for 49 vertices."""
     other = interpolated("both")
     shorter = replace(getattr(other, part), weights=getattr(other, part).weights[:-1])
-    arrays = tuple(f"weights_{part}_{name}" for name in ("data", "indices", "indptr"))
-    assert set(arrays) <= storage._arrays(other).keys()
+    arrays = tuple(f"{part}.weights_{name}" for name in ("data", "indices", "indptr"))
+    assert set(arrays) <= other.stored()[1].keys()
     with pytest.raises(prt.PrtError, match="damaged"):
-        prt.load_transport(spliced(tmp_path, arrays, replace(other, **{part: shorter})))
+        prt.load_transport(spliced(tmp_path, arrays, altered(other, **{part: shorter})))
 
 
 def test_a_plain_indirect_part_is_not_mistaken(tmp_path):

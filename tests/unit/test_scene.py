@@ -445,9 +445,9 @@ def test_hash_and_keys_do_not_depend_on_order() -> None:
     b = build(edge_length=0.8, **dict(reversed(shelf().items())))
     assert [m.name for m in a.meshes] == list(reversed([m.name for m in b.meshes]))
     assert a.hash == b.hash
-    assert a.vertex_keys.dtype == np.uint64
-    assert not np.array_equal(a.vertex_keys, b.vertex_keys)
-    np.testing.assert_array_equal(np.sort(a.vertex_keys), np.sort(b.vertex_keys))
+    assert a.measurement.keys.dtype == np.uint64
+    assert not np.array_equal(a.measurement.keys, b.measurement.keys)
+    np.testing.assert_array_equal(np.sort(a.measurement.keys), np.sort(b.measurement.keys))
 
 
 @pytest.mark.parametrize("edge_length", [None, INF])
@@ -463,14 +463,14 @@ def test_hash_and_keys_survive_mitsubas_merging(tmp_path: Path, edge_length: flo
     merged = Scene.from_mitsuba(mi.load_file(str(path), optimize=True), edge_length)
     assert len(merged.meshes) < len(apart.meshes) == 5
     assert merged.hash == apart.hash
-    np.testing.assert_array_equal(np.sort(merged.vertex_keys), np.sort(apart.vertex_keys))
+    np.testing.assert_array_equal(np.sort(merged.measurement.keys), np.sort(apart.measurement.keys))
 
 
 def test_keys_find_the_same_vertex_in_another_scene() -> None:
     a = build(edge_length=0.8, **shelf())
     b = build(edge_length=0.8, **dict(reversed(shelf().items())))
-    order = np.argsort(b.vertex_keys)
-    found = order[np.searchsorted(b.vertex_keys, a.vertex_keys, sorter=order)]
+    order = np.argsort(b.measurement.keys)
+    found = order[np.searchsorted(b.measurement.keys, a.measurement.keys, sorter=order)]
     np.testing.assert_array_equal(b.positions[found], a.positions)
     np.testing.assert_array_equal(b.normals[found], a.normals)
     np.testing.assert_array_equal(b.albedo[found], a.albedo)

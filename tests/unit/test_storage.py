@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from conftest import FORMS, made_up
+from conftest import FORMS, altered, made_up
 
 import mi_sparse_prt as prt
-from mi_sparse_prt import storage
+from mi_sparse_prt import transport as transport_module
+from mi_sparse_prt.io import store
 from mi_sparse_prt.transport import LightTransport
 
 COMPRESSED = {"wavelets", "clusters"}
@@ -21,7 +22,7 @@ COMPRESSED = {"wavelets", "clusters"}
 
 def assert_same(a: LightTransport, b: LightTransport) -> None:
     """Bit by bit, factors, order and report."""
-    factors = [storage._arrays(t) for t in (a, b)]
+    factors = [t.stored()[1] for t in (a, b)]
     assert factors[0].keys() == factors[1].keys()
     for name, array in factors[0].items():
         assert array.dtype == factors[1][name].dtype, name
@@ -78,7 +79,7 @@ def test_round_trip(tmp_path, form):
 
 def test_several_chunks(tmp_path, monkeypatch):
     """More vertices than a chunk, and a last chunk that is not full."""
-    monkeypatch.setattr(storage, "_VERTEX_CHUNK", 16)
+    monkeypatch.setattr(store, "_ROWS", 16)
     transport = made_up("fixed point and full indirect", n=1, n_vertices=50)
     transport.save(tmp_path / "a.prt")
     assert_same(transport, prt.load_transport(tmp_path / "a.prt"))
@@ -87,11 +88,11 @@ def test_several_chunks(tmp_path, monkeypatch):
 def test_a_dark_matrix(tmp_path):
     """Zeros are Zarr's fill value: such chunks must be written all the same, or a lost one would go unnoticed."""
     transport = made_up("bits")
-    dark = replace(transport, direct=replace(transport.direct, bits=np.zeros_like(transport.direct.bits)))
+    dark = altered(transport, direct=replace(transport.direct, bits=np.zeros_like(transport.direct.bits)))
     dark.save(tmp_path / "a.prt")
     assert_same(dark, prt.load_transport(tmp_path / "a.prt"))
     with zipfile.ZipFile(tmp_path / "a.prt") as file:
-        assert any(name.startswith("visibility/c/") for name in file.namelist())
+        assert any(name.startswith("direct.visibility/c/") for name in file.namelist())
 
 
 def test_the_report_of_a_precomputation_comes_back(tmp_path, grey_scene):
@@ -107,7 +108,7 @@ def test_the_report_of_a_precomputation_comes_back(tmp_path, grey_scene):
 def test_names_beyond_ascii(tmp_path):
     transport = made_up("bits")
     mesh = replace(transport.meshes[0], name="Häschen / 兎 #1")
-    transport = replace(transport, meshes=(mesh, *transport.meshes[1:]))
+    transport = altered(transport, meshes=(mesh, *transport.meshes[1:]))
     path = tmp_path / "Wörter mit Leerzeichen.prt"
     transport.save(path)
     assert_same(transport, prt.load_transport(str(path)))
@@ -198,7 +199,8 @@ def test_arrays_that_do_not_fit_together(tmp_path, saved):
     made_up("bits and coarse indirect", n=2, n_vertices=12).save(other)
     with zipfile.ZipFile(other) as file:
         strange = {name: file.read(name) for name in file.namelist()}
-    for array in ("albedo", "visibility", "normals", "indirect", "vertex_keys"):
+    members = ("direct.visibility", "direct.normals", "indirect.density")
+    for array in ("reflection.albedo", "measurement.keys", *members):
         path = rewritten(
             saved[1], tmp_path / "a.prt", lambda n, c, a=array: strange[n] if n.startswith(a + "/") else c
         )
@@ -207,7 +209,16 @@ def test_arrays_that_do_not_fit_together(tmp_path, saved):
 
 @pytest.mark.parametrize(
     "attributes",
-    [{"resolution": 3}, {"resolution": 4}, {"basis": "sphere"}, {"meshes": [["a", 0]]}, {"version": None}],
+    [
+        {"emission": {"kind": "cubemap", "resolution": 3}},
+        {"emission": {"kind": "cubemap", "resolution": 4}},
+        {"emission": {"kind": "moon"}},
+        {"basis": "sphere"},
+        {"measurement": {"kind": "vertices", "groups": [["a", 0]]}},
+        {"reflection": {"kind": "velvet"}},
+        {"operators": {"direct": "magic"}},
+        {"version": None},
+    ],
     ids=str,
 )
 def test_attributes_that_make_no_sense(tmp_path, saved, attributes):
@@ -217,30 +228,50 @@ def test_attributes_that_make_no_sense(tmp_path, saved, attributes):
 
 
 def test_a_file_of_a_newer_version(tmp_path, saved):
-    path = rewritten(saved[1], tmp_path / "a.prt", changed_attributes(version=storage.VERSION + 1))
+    path = rewritten(saved[1], tmp_path / "a.prt", changed_attributes(version=transport_module.VERSION + 1))
     refused(path, "newer")
     untouched = rewritten(saved[1], tmp_path / "b.prt", changed_attributes())
     assert_same(saved[0], prt.load_transport(untouched))  # the tool above does no damage by itself
 
 
-@pytest.mark.parametrize("form", [form for form in FORMS if not COMPRESSED & set(form.split())])
-def test_files_of_the_version_before(tmp_path, form):
-    """Version 4 had no areas and nothing compressed, and was as this one otherwise: all areas are alike then."""
-    transport = made_up(form)
-    transport.save(tmp_path / "a.prt")
+DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.mark.parametrize("number", range(len(FORMS)))
+def test_files_of_version_6(number):
+    """Written by the code that wrote that version, of every form; what it computed from them is beside them."""
+    loaded, known = prt.load_transport(DATA / f"version_6_{number}.prt"), np.load(DATA / "version_6.npz")
+    np.testing.assert_allclose(loaded.rows(np.arange(24)), known[f"rows_{number}"], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(loaded.relight(known["light"]), known[f"relit_{number}"], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "key"), [("glossy", "glossy"), ("glossy_clusters", "clusters")])
+def test_glossy_files_of_version_6(name, key):
+    loaded, known = prt.load_transport(DATA / f"version_6_{name}.prt"), np.load(DATA / "version_6.npz")
+    found = loaded.coefficients(known["light"])
+    np.testing.assert_allclose(found.white, known[f"{key}_white"], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found.terms, known[f"{key}_terms"], rtol=1e-4, atol=1e-5)
+    if name == "glossy":
+        towards = loaded.relight(known["light"], [0.1, 0.9, 0.3])
+        np.testing.assert_allclose(towards, known["glossy_up"], rtol=1e-4, atol=1e-6)
+
+
+def test_files_of_version_4(tmp_path):
+    """They had no areas: all are alike then."""
 
     def without_areas(name: str, content: bytes) -> bytes | None:
         return None if name.startswith("areas/") else changed_attributes(version=4)(name, content)
 
-    old = rewritten(tmp_path / "a.prt", tmp_path / "b.prt", without_areas)
-    assert_same(replace(transport, areas=np.ones_like(transport.areas)), prt.load_transport(old))
+    old = rewritten(DATA / "version_6_0.prt", tmp_path / "b.prt", without_areas)
+    assert (prt.load_transport(old).measurement.areas == 1).all()
 
 
 def test_labels_of_clusters_that_are_not_there(tmp_path):
     transport = made_up("clusters")
-    labels = transport.direct.labels.copy()
-    labels[3] = len(transport.direct.means)
-    replace(transport, direct=replace(transport.direct, labels=labels)).save(tmp_path / "a.prt")
+    clustered = transport.operators["compressed"]
+    labels = clustered.labels.copy()
+    labels[3] = len(clustered.means)
+    replace(transport, operators={"compressed": replace(clustered, labels=labels)}).save(tmp_path / "a.prt")
     refused(tmp_path / "a.prt", "clusters")
 
 
@@ -258,7 +289,7 @@ def test_lists_of_texels_that_make_no_sense(tmp_path, what):
     else:
         texels[starts[2] - 1] = 96
     damaged = replace(direct, starts=starts, texels=texels, shares=shares)
-    replace(transport, direct=damaged).save(tmp_path / "a.prt")
+    altered(transport, direct=damaged).save(tmp_path / "a.prt")
     refused(tmp_path / "a.prt")
 
 
@@ -268,7 +299,7 @@ def test_no_texel_seen_in_part(tmp_path):
     direct = transport.direct
     starts = np.zeros_like(direct.starts)
     empty = replace(direct, starts=starts, texels=direct.texels[:0], shares=direct.shares[:0])
-    transport = replace(transport, direct=empty)
+    transport = altered(transport, direct=empty)
     transport.save(tmp_path / "a.prt")
     assert_same(transport, prt.load_transport(tmp_path / "a.prt"))
 
@@ -282,7 +313,7 @@ def test_a_file_of_another_scene(saved, grey_scene):
 
 
 def failing_write(error: BaseException):
-    def write(transport: LightTransport, path: str) -> None:
+    def write(path: Path, attributes: dict, arrays: dict) -> None:
         Path(path).write_bytes(b"half of it")
         raise error
 
@@ -293,14 +324,14 @@ def failing_write(error: BaseException):
     "error", [KeyboardInterrupt(), MemoryError(), ValueError("bug"), SystemExit(1)], ids=repr
 )
 def test_an_interrupted_save_leaves_nothing(tmp_path, monkeypatch, error):
-    monkeypatch.setattr(storage, "_write", failing_write(error))
+    monkeypatch.setattr(store, "_write", failing_write(error))
     with pytest.raises(type(error)):
         made_up("bits").save(tmp_path / "a.prt")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(storage, "_write", failing_write(OSError(errno.ENOSPC, "No space left on device")))
+    monkeypatch.setattr(store, "_write", failing_write(OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(prt.PrtError, match="No space left") as error:
         made_up("bits").save(tmp_path / "a.prt")
     assert "\n" not in str(error.value)
@@ -314,7 +345,7 @@ def test_an_existing_file_survives_a_failed_save(tmp_path, monkeypatch):
     first.save(path)
     for error in (KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")):
         with monkeypatch.context() as patch:
-            patch.setattr(storage, "_write", failing_write(error))
+            patch.setattr(store, "_write", failing_write(error))
             with pytest.raises((KeyboardInterrupt, prt.PrtError)):
                 made_up("fixed point").save(path)
     assert_same(first, prt.load_transport(path))
@@ -366,7 +397,7 @@ def test_the_umask_decides_who_may_read(tmp_path):
 @pytest.mark.parametrize("what", ["starts", "length", "order", "range", "channels"])
 def test_wavelet_coefficients_that_make_no_sense(tmp_path, what):
     transport = made_up("wavelets")
-    direct = transport.direct
+    direct = transport.operators["compressed"]
     starts, places, values, scales = (
         x.copy() for x in (direct.starts, direct.places, direct.values, direct.scales)
     )
@@ -381,5 +412,5 @@ def test_wavelet_coefficients_that_make_no_sense(tmp_path, what):
     else:
         scales = scales[:, :1]
     damaged = replace(direct, starts=starts, places=places, values=values, scales=scales)
-    replace(transport, direct=damaged).save(tmp_path / "a.prt")
+    replace(transport, operators={"compressed": damaged}).save(tmp_path / "a.prt")
     refused(tmp_path / "a.prt")

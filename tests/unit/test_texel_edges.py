@@ -1,14 +1,13 @@
 """Visible areas of texels from traced edges: tables, areas of squares, analytic occluders, and supersampling."""
 
 from collections import Counter
-from dataclasses import replace
 from itertools import combinations
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import build, bumpy_ball, diffuse, mesh
+from conftest import altered, build, bumpy_ball, diffuse, mesh
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.bits import above_horizon, pack, unpack
@@ -342,7 +341,7 @@ def test_the_order_of_vertices_and_blocks_does_not_matter(grey_scene, monkeypatc
     assert same(whole, again) and rays == rays_again > 0
     order = np.random.default_rng(0).permutation(len(bits))
     other = DirectSolver(direct.scene, direct.lighting, chosen(direct.points, order))
-    assert same(fractional_visibility(other, bits_of(other))[0], whole.reordered(order))
+    assert same(fractional_visibility(other, bits_of(other))[0], whole.take(order))
 
 
 def test_rays_are_those_that_were_traced(grey_scene):
@@ -385,8 +384,8 @@ def test_held_out_elements_tell_the_error(grey_scene):
     transport = prt.precompute(
         grey_scene, direct.lighting, method="brute_force", basis="texel", max_depth=2, progress=False
     )
-    transport = replace(transport, direct=part)
-    exact = replace(transport, direct=supersampled(direct, 8)).rows(np.arange(len(direct.points)))
+    transport = altered(transport, direct=part)
+    exact = altered(transport, direct=supersampled(direct, 8)).rows(np.arange(len(direct.points)))
     ours = transport.rows(np.arange(len(direct.points)))
     truth = np.linalg.norm(ours - exact) / np.linalg.norm(exact)
     runs = [held_out_error(grey_scene, transport, 2, seed) for seed in (10, 11, 12)]
