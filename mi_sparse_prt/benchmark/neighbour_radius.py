@@ -17,6 +17,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import relative_l2_from_squares
 from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS, RELATIVE_LAMBDA
@@ -61,9 +62,10 @@ class _Samples:
 
     def neighbours(self, vertex: int, radius: float) -> NDArray[np.int32]:
         """Dense vertices (k,) within the radius, nearest first."""
-        distance = np.linalg.norm(self.dense_positions - self.positions[vertex], axis=1)
-        near = np.flatnonzero(distance <= radius)
-        return near[np.argsort(distance[near], kind="stable")].astype(np.int32)
+        ids = radius_neighbours(
+            self.positions[[vertex]], self.dense_positions, radius, len(self.dense_positions)
+        ).ids[0]
+        return ids[ids >= 0]
 
 
 def error_against_radius(

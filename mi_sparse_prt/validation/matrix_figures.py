@@ -82,7 +82,7 @@ def images(
 
 def picture_row(pictures: Mapping[str, NDArray[np.floating]], cmap: str = "viridis") -> Figure:
     """Pictures (height, width, 3), or numbers (height, width) as colours, in [0, 1], side by side with their titles."""
-    figure = Figure(figsize=(5 * len(pictures), 4.2), layout="constrained")
+    figure = Figure(figsize=(max(7, 5 * len(pictures)), 4.2), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(pictures)))
     for axes, (title, picture) in zip(panels, pictures.items(), strict=True):
         axes.imshow(np.clip(picture, 0, 1), vmin=0, vmax=1, cmap=cmap)

@@ -6,6 +6,7 @@ import tracemalloc
 from functools import cache
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import COLOURS, GREY, T, build, diffuse, made_up, mesh, still_life
@@ -23,8 +24,29 @@ from mi_sparse_prt.transport import LightTransport
 LIGHTING = prt.CubemapLighting(8)
 N = LIGHTING.n_directions
 METHODS = ("sparse", "huang2010")
-WORST = {"sparse": 0.12, "huang2010": 0.35}  # relative L2 of the direct light of so small and coarse a scene
 EDGE = 0.25
+# Mean and standard deviation over 8 seeds (0 to 7), at 8 x 8 texels per face, by method and max_depth; a tolerance is
+# three of the latter. ERROR: relative L2, of direct light for max_depth 2, as estimated for 4. EVEN: that of the
+# vertices under an even sky. GAIN: all of their light over that of brute force. ELEMENTS: share that is evaluated.
+ERROR = {
+    ("sparse", 2): (0.0757, 0.0136),
+    ("sparse", 4): (0.0900, 0.0119),
+    ("huang2010", 2): (0.2002, 0.0080),
+    ("huang2010", 4): (0.1971, 0.0084),
+}
+EVEN = {
+    ("sparse", 2): (0.0260, 0.0035),
+    ("sparse", 4): (0.0334, 0.0030),  # brute force has 4 paths: 1% of noise
+    ("huang2010", 2): (0.0641, 0.0105),
+    ("huang2010", 4): (0.0351, 0.0089),
+}
+GAIN = {"sparse": (1.0033, 0.0015), "huang2010": (1.0104, 0.0042)}
+ELEMENTS = {
+    ("sparse", 2): (0.2337, 0.0051),
+    ("sparse", 4): (0.2625, 0.0060),
+    ("huang2010", 2): (0.2962, 0.0062),
+    ("huang2010", 4): (0.3651, 0.0052),
+}
 
 
 def precompute(scene: prt.Scene, method: str, max_depth: int = 2, **parameters: object) -> LightTransport:
@@ -128,18 +150,58 @@ def test_what_sparse_evaluates_is_exact(monkeypatch):
 def test_the_error_is_small(method, max_depth):
     """Rationale: the direct light is what sharp shadows are made of; indirect light is 5% of this scene.
 
-    Expected: direct light within 12% (sparse) and 35% (as published) of brute force in relative L2 at 8 x 8 texels per
-    face; sums over the sky, what even light gives, within 5% and 20%.
+    Expected: what eight seeds had, within three standard deviations: 7.6% +- 1.4% (sparse) and 20.0% +- 0.8% (as
+    published) at 8 x 8 texels per face; under an even sky, where errors of texels cancel, 2.6% and 6.4%.
     """
     transport = result(method, max_depth)
-    if max_depth == 2:
-        assert transport.indirect is None
-        assert 0.001 < true_error(transport) < WORST[method]
-    else:
-        assert transport.report["estimated_error"]["total"] < WORST[method]
-    even = transport.relight(1.0)
+    assert (transport.indirect is None) == (max_depth == 2)
+    error = true_error(transport) if max_depth == 2 else transport.report["estimated_error"]["total"]
+    assert error == within_three_deviations(ERROR[method, max_depth])
     expected = (brute_force() if max_depth == 2 else full()).relight(1.0)
-    assert relative(even, expected) < {"sparse": 0.05, "huang2010": 0.2}[method]
+    mean, deviation = EVEN[method, max_depth]
+    assert relative(transport.relight(1.0), expected) < mean + 3 * deviation
+
+
+def within_three_deviations(measured: tuple[float, float]) -> Any:
+    return pytest.approx(measured[0], abs=3 * measured[1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_light_is_won_or_lost(method):
+    """All direct light under an even sky, over brute force's, over 4 seeds.
+
+    Rationale: errors of single elements are large, and a bias of 2% would hide among them.
+    Expected: a gain of +0.33% (sparse) and +1.04% (as published: values that were sampled are not kept, and weights
+    overshoot), within three standard errors of four seeds and of the eight that these figures are of: 0.3% and 0.8%.
+    """
+    expected = brute_force().relight(1.0).sum()
+    gains = [precompute(scene(), method, seed=seed).relight(1.0).sum() / expected for seed in range(4)]
+    mean, deviation = GAIN[method]
+    assert np.mean(gains) == pytest.approx(mean, abs=3 * deviation * np.sqrt(1 / 4 + 1 / 8))
+
+
+def test_rates_of_huang2010_are_those_of_figure_9():
+    """At the paper's resolution, 6 x 32 x 32, on 3369 vertices.
+
+    Rationale: a share of dense vertices or directions that is off makes the comparison unfair to the paper.
+    Expected ([HR10] Figure 9): 20.52% of a ground's vertices are dense and 25% of others; 29.3 to 31.3% of their
+    directions, and 350 of 6144 of a sparse vertex, where as many differ; in all 10.5 to 12.1% of the elements.
+    Result: over six seeds 29.8 to 32.8% of directions (the ground of this scene has more edges of shadows in view),
+    5.0 to 5.7%, 11.1 to 11.3% in all; relative L2 16.1% +- 0.3%.
+    """
+    scene, lighting = build(0.12, **still_life()), prt.CubemapLighting(32)
+    options: dict[str, Any] = {"max_depth": 2, "progress": False}
+    transport = prt.precompute(scene, lighting, "huang2010", **options)
+    for part in scene.meshes:
+        rates, n = transport.report["sampling"][part.name], part.vertices.stop - part.vertices.start
+        dense = 0.2052 if part.name == "ground" else 0.25
+        assert rates["dense_vertices"] == pytest.approx(dense, abs=1.5 / n)
+        assert 0.29 < rates["dense_directions"] < 0.335
+        assert 0.049 < rates["sparse_directions"] <= 350 / 6144
+    elements = transport.report["elements_evaluated"] / transport.report["elements_total"]
+    assert 0.105 < elements < 0.12
+    exact = prt.precompute(scene, lighting, "brute_force", **options)
+    assert relative(rows(transport), rows(exact)) == pytest.approx(0.161, abs=0.009)
 
 
 @cache
@@ -195,7 +257,8 @@ def test_the_report(method, max_depth):
     report = result(method, max_depth).report
     assert json.loads(json.dumps(report)) == report
     assert report["elements_total"] == scene().n_vertices * N
-    assert 0.02 * report["elements_total"] < report["elements_evaluated"] < 0.6 * report["elements_total"]
+    share = report["elements_evaluated"] / report["elements_total"]
+    assert share == within_three_deviations(ELEMENTS[method, max_depth])
 
     # the rates of the meshes say the same as the total
     total = 0.0
@@ -247,8 +310,8 @@ def shuffled(source: prt.Scene, seed: int) -> prt.Scene:
         order = rng.permutation(n) if seed else np.arange(n)  # new vertex i was vertex order[i]
         triangles = np.argsort(order)[part.triangles]
         shape = mesh(part.name, source.positions[part.vertices][order], triangles, diffuse(*COLOURS[k]))
-        parameters = prt.scene.mi.traverse(shape)
-        parameters["vertex_normals"] = prt.scene.mi.Float(source.normals[part.vertices][order].ravel())
+        parameters = mi.traverse(shape)
+        parameters["vertex_normals"] = mi.Float(source.normals[part.vertices][order].ravel())
         parameters.update()
         shapes[part.name] = shape
     return build(float("inf"), **shapes)
@@ -291,12 +354,17 @@ def test_a_merged_scene_gets_the_same_rows(method):
     ids=["a thousandth", "a thousand times", "moved", "as published"],
 )
 def test_place_and_scale(method, scale, offset):
-    """Keys and with them the dense vertices are others; errors and costs stay what they are."""
+    """Keys and with them the dense vertices are others; errors and costs stay what they are.
+
+    Expected: means over 4 seeds within three standard deviations of a single seed over sqrt(4), here and there.
+    """
     place = T().translate([offset] * 3).scale(scale)
-    there = precompute(build(EDGE * scale, **still_life(place=place)), method)
-    here = result(method, 2)
-    assert 0.6 < there.report["estimated_error"]["total"] / here.report["estimated_error"]["total"] < 1.6
-    assert there.report["elements_evaluated"] == pytest.approx(here.report["elements_evaluated"], rel=0.15)
+    moved = build(EDGE * scale, **still_life(place=place))
+    found = [precompute(moved, method, seed=seed).report for seed in range(4)]
+    errors = np.mean([report["estimated_error"]["total"] for report in found])
+    elements = np.mean([report["elements_evaluated"] / report["elements_total"] for report in found])
+    for value, (mean, deviation) in ((errors, ERROR[method, 2]), (elements, ELEMENTS[method, 2])):
+        assert value == pytest.approx(mean, abs=3 * deviation * np.sqrt(1 / 4 + 1 / 8))
 
 
 # ------------------------------------------------------------------------------------ special scenes
@@ -363,7 +431,7 @@ def test_no_rows_are_asked_for(grey_scene: prt.Scene) -> None:
 
 
 def test_huang2010_has_no_target_error(grey_scene: prt.Scene) -> None:
-    with pytest.raises(prt.errors.PrtError, match="target error"):
+    with pytest.raises(prt.PrtError, match="target error"):
         prt.precompute(
             grey_scene, prt.CubemapLighting(4), method="huang2010", target_error=0.1, progress=False
         )
@@ -433,5 +501,5 @@ def test_sparse_meets_a_target_error():
     loose, tight = (transport.report["elements_evaluated"] for transport in found)
     assert 1.5 * loose < tight
     assert found[0].report["sampling"]["ground"]["dense_vertices"] < 0.5
-    with pytest.warns(prt.errors.PrtWarning, match="not met"):
+    with pytest.warns(prt.PrtWarning, match="not met"):
         precompute(scene(), "sparse", target_error=1e-5)

@@ -379,21 +379,23 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
 def test_predicted_errors_are_those_of_the_matrix():
     """Paths, coarse and fine, and gathered light: the error that held-out elements estimate, within its noise.
 
-    Expected: the pilot's 192 vertices and the check's elements know it within some percent each.
+    Expected: the pilot's 192 vertices and the check's elements know it within some percent each. Predicted over
+    estimated errors were, in mean and standard deviation over eight seeds, 0.969 +- 0.038, 0.962 +- 0.030 and
+    1.048 +- 0.039; one seed is within three of the latter of the former.
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
     direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
     costs = measure(scene, direct, Settings(8, target_error=0.04), indirect=True)
     assert costs.paths is not None and costs.gather is not None
     plans = [
-        (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.2),
-        (Plan("exact", "paths", resolution=4, spp=8), costs.paths.error(4, 8), 0.25),
-        (Plan("exact", "gather", 64, 0.06), costs.gather.error(64, 0.06), 0.5),
+        (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.969, 0.038),
+        (Plan("exact", "paths", resolution=4, spp=8), costs.paths.error(4, 8), 0.962, 0.030),
+        (Plan("exact", "gather", 64, 0.06), costs.gather.error(64, 0.06), 1.048, 0.039),
     ]
-    for plan, predicted, tolerance in plans:
+    for plan, predicted, mean, deviation in plans:
         found = prt.precompute(scene, lighting, plan, progress=False).report["estimated_error"]["total"]
         print(f"{plan.indirect}: predicted {predicted:.3%}, estimated {found:.3%}")
-        assert predicted == pytest.approx(found, rel=tolerance)
+        assert predicted / found == pytest.approx(mean, abs=3 * deviation)
 
 
 @pytest.mark.parametrize("indirect", [True, False])

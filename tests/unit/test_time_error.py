@@ -100,7 +100,7 @@ def test_a_matrix_by_regional_columns(choice, scene, lighting):
     even.data = np.repeat(1 / np.diff(even.indptr), np.diff(even.indptr)).astype(np.float32)
     mean = np.linalg.norm(type(transport.direct)(transport.direct.dense, even).rows(ids)[..., 0] - truth)
     assert error < mean
-    assert error < 0.35 * np.linalg.norm(truth)
+    assert error < 0.24 * np.linalg.norm(truth)  # six seeds: 21.0% +- 1.0% in either way
 
     report = transport.report
     n_dense = weights.shape[1]
