@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import ARTEFACTS, COLOURS, T, build, still_life
+from conftest import ARTEFACTS, COLOURS, T, altered, build, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
@@ -161,7 +161,7 @@ def test_a_bad_matrix_is_noticed(scene):
     transport = precomputed(scene, spp=2048)
 
     def report(**changes: object) -> dict:
-        return validated(scene, replace(transport, **changes), image=False, spp=256, n_rows=60).report
+        return validated(scene, altered(transport, **changes), image=False, spp=256, n_rows=60).report
 
     good = report()
     assert good["relative_l2"]["total"] < 0.01

@@ -377,7 +377,7 @@ def test_weighted_sums_are_those_of_all_elements(exact):
     """
     scene, transport = exact
     lighting = transport.lighting
-    transport = replace(flipped(transport, 50, seed=3), indirect=made_of_light(scene, lighting))
+    transport = altered(flipped(transport, 50, seed=3), indirect=made_of_light(scene, lighting))
     inside = scene.meshes[1].vertices
     values = np.random.default_rng(4).random((scene.n_vertices, lighting.n_directions)) + 0.5
     above = scene.normals @ lighting.directions.T > 0

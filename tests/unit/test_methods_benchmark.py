@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from conftest import COLOURS, T, build, diffuse, still_life
+from conftest import COLOURS, T, altered, build, diffuse, still_life
 from rich.console import Console
 
 import mi_sparse_prt as prt
@@ -136,9 +136,7 @@ def test_errors_of_the_direct_part(grey_scene, small_lighting, brute_force):
     vertex, texel = np.unravel_index(np.argmax(rows * lit), rows.shape)
     bits = exact.bits.copy()
     bits[mesh.vertices.start + vertex, texel // 32] ^= np.uint32(1 << (texel % 32))
-    wrong = prt.LightTransport(
-        **vars(brute_force) | {"direct": type(exact)(bits, exact.normals, small_lighting)}
-    )
+    wrong = altered(brute_force, direct=type(exact)(bits, exact.normals, small_lighting))
     found = direct_error(exact, wrong)
     size = rows[vertex, texel]
     assert found.relative_l2(mesh.name) == pytest.approx(size / np.linalg.norm(rows), rel=1e-5)
@@ -225,9 +223,7 @@ def test_direct_errors_under_a_light_are_exact(small_lighting):
     )
     exact = prt.precompute(scene, small_lighting, "brute_force", max_depth=2, progress=False)
     bits = exact.direct.bits & np.uint32(0xFFFF00FF)
-    wrong = prt.LightTransport(
-        **vars(exact) | {"direct": type(exact.direct)(bits, exact.direct.normals, small_lighting)}
-    )
+    wrong = altered(exact, direct=type(exact.direct)(bits, exact.direct.normals, small_lighting))
     relit = RelitReference(scene, exact.direct, progress=False, effort=QUICK.relit)
     light = small_lighting.project(relit.environments["sky"])
     found = relit.errors(wrong)["environments"]

@@ -35,6 +35,7 @@ from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import MOST
+from mi_sparse_prt.solvers.problem import diffuse_problem
 
 LIGHTING = prt.CubemapLighting(4)
 EXACT = {"exact": DirectCost(10.0, 0.0)}
@@ -164,7 +165,9 @@ def test_after_a_miss_as_if_all_predictions_were_as_far_off():
 def test_gathering_learns_its_bias(grey_scene):
     """The error that was found is then the one that is predicted, and noise falls from there."""
     direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
-    costs = measure(grey_scene, direct, Settings(4, max_depth=4), indirect=True).gather
+    costs = measure(
+        diffuse_problem(grey_scene, direct.lighting), direct, Settings(4, max_depth=4), indirect=True
+    ).gather
     assert costs is not None
     for error in (0.5 * costs.error(64, 0.06), 2 * costs.error(64, 0.06)):
         now = costs.learned(64, 0.06, error)
@@ -385,7 +388,9 @@ def test_predicted_errors_are_those_of_the_matrix():
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
     direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
-    costs = measure(scene, direct, Settings(8, target_error=0.04), indirect=True)
+    costs = measure(
+        diffuse_problem(scene, direct.lighting), direct, Settings(8, target_error=0.04), indirect=True
+    )
     assert costs.paths is not None and costs.gather is not None
     plans = [
         (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.969, 0.038),
@@ -401,7 +406,12 @@ def test_predicted_errors_are_those_of_the_matrix():
 @pytest.mark.parametrize("indirect", [True, False])
 def test_costs_of_what_is_left_open(grey_scene, indirect):
     direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene), "texel")
-    costs = measure(grey_scene, direct, Settings(4, basis="texel", indirect_resolution=2), indirect)
+    costs = measure(
+        diffuse_problem(grey_scene, direct.lighting),
+        direct,
+        Settings(4, basis="texel", indirect_resolution=2),
+        indirect,
+    )
     assert costs.direct.keys() == {"exact", "edges"}  # consensus and "sparse" are of the other basis
     assert 0 < costs.direct["edges"].error < costs.direct["exact"].error
     assert costs.sparse is None
@@ -418,7 +428,7 @@ def test_a_room_without_light():
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": diffuse(*GREY[0])}
     scene = build(0.5, room=room, box=box)
     direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
-    costs = measure(scene, direct, Settings(4, max_depth=4), indirect=True)
+    costs = measure(diffuse_problem(scene, direct.lighting), direct, Settings(4, max_depth=4), indirect=True)
     assert costs.gather is not None
     assert costs.gather.rank(0.03) == costs.gather.error(64, 0.06) == 0
     assert costs.direct["consensus"].error == 0
@@ -431,6 +441,8 @@ def test_other_materials_are_not_gathered_from():
         warnings.simplefilter("ignore", prt.PrtWarning)
         scene = build(0.5, **shapes)
     direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
-    costs = measure(scene, direct, Settings(4, max_depth=3, spp=2), indirect=True)
+    costs = measure(
+        diffuse_problem(scene, direct.lighting), direct, Settings(4, max_depth=3, spp=2), indirect=True
+    )
     assert costs.gather is None
     assert costs.paths is not None and costs.sparse is not None

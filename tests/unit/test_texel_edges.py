@@ -14,12 +14,15 @@ from mi_sparse_prt.core.bits import above_horizon, pack, unpack
 from mi_sparse_prt.emission.cubemap import FACE_FRAMES
 from mi_sparse_prt.emission.texel_adjacency import TexelSides
 from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.solvers import texel_edges
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.texel_edges import STEPS, _cut_off, _quadrant, fractional_visibility
 
 # ------------------------------------------------------------------------------------ which texels meet
@@ -388,7 +391,10 @@ def test_held_out_elements_tell_the_error(grey_scene):
     exact = altered(transport, direct=supersampled(direct, 8)).rows(np.arange(len(direct.points)))
     ours = transport.rows(np.arange(len(direct.points)))
     truth = np.linalg.norm(ours - exact) / np.linalg.norm(exact)
-    runs = [held_out_error(grey_scene, transport, 2, seed) for seed in (10, 11, 12)]
+    problem = Problem(
+        grey_scene, direct.lighting, mesh_vertices(grey_scene), Diffuse(grey_scene.albedo), "texel", 2
+    )
+    runs = [held_out_error(problem, transport, seed) for seed in (10, 11, 12)]
     found = np.mean([run["total"] for run in runs])
     width = np.sqrt(sum(run["standard_error"]["total"] ** 2 for run in runs)) / 3
     assert width < 0.15 * truth
