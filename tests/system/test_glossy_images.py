@@ -6,7 +6,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, altered, build, diffuse
+from conftest import T, build, diffuse
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.precompute import precompute_glossy
@@ -130,15 +130,15 @@ def test_another_order_of_shapes(scene, transport, good):
     """The transport of a scene whose shapes came in another order is as good: its rows are moved first."""
     n = len(transport.albedo)
     back = np.roll(np.arange(n), n // 3)
-    glossy = np.flatnonzero(transport.material[back] >= 0)
-    old = np.searchsorted(transport.glossy, back[glossy])
+    reflection, measurement = transport.reflection, transport.measurement
+    glossy = np.flatnonzero(reflection.material[back] >= 0)
+    old = np.searchsorted(reflection.glossy, back[glossy])
     rows = np.concatenate([back, (n + old[:, None] * transport.terms + np.arange(transport.terms)).ravel()])
-    names = ("albedo", "areas", "tangents", "normals", "material", "vertex_keys")
-    moved = altered(
+    moved = replace(
         transport,
-        direct=transport.direct.take(back),
-        indirect=transport.indirect.take(rows),
-        **{name: getattr(transport, name)[back] for name in names},
+        measurement=replace(measurement, keys=measurement.keys[back], areas=measurement.areas[back]),
+        reflection=reflection.take(back),
+        operators={name: operator.take(rows) for name, operator in transport.operators.items()},
     )
     assert errors(validated(scene, moved)) == pytest.approx(errors(good), rel=1e-3, abs=1e-5)
 
@@ -167,7 +167,7 @@ def test_wrong_factors_are_blamed_on_factorization(scene, good):
 
 def test_missing_light_is_blamed_on_transport(scene, transport, good):
     """Without indirect light: an image that is a tenth darker at most is noticed."""
-    found = errors(validated(scene, altered(transport, indirect=None)))
+    found = errors(validated(scene, replace(transport, operators={"direct": transport.direct})))
     assert errors(good)["transport"] < 0.04  # as above
     assert found["transport"] > 0.06
 

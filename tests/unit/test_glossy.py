@@ -6,6 +6,7 @@ import pytest
 from conftest import build, diffuse
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.reflection.frames import frames, orthogonalise
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
@@ -78,7 +79,7 @@ def test_all_ways_to_ask_agree(glossy: LightTransport) -> None:
     np.testing.assert_allclose(direct.apply(light)[:, 0], every[..., 0] @ light, atol=1e-5)
     few = direct.take(ids)
     np.testing.assert_array_equal(few.rows(np.arange(len(ids))), every[ids])
-    np.testing.assert_allclose(ColumnBlocks(few).at(texels), every[ids][:, texels, 0], atol=1e-7)
+    np.testing.assert_allclose(np.array(ColumnBlocks(few).at(texels)), every[ids][:, texels, 0], atol=1e-7)
     words, signs = np.array([1, 5]), rng.choice(np.array([-1, 1], np.float32), (2, 32))
     sums = sum(every[:, 32 * w : 32 * w + 32, 0] * s for w, s in zip(words, signs, strict=True))
     np.testing.assert_allclose(direct.combined(words, signs), sums, atol=1e-6)

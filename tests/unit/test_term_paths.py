@@ -8,12 +8,15 @@ import pytest
 from conftest import T, build, diffuse
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid
 from mi_sparse_prt.reflection.factor_tables import table_directions
 from mi_sparse_prt.reflection.frames import frames, orthogonalise
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
@@ -40,32 +43,42 @@ def cosines(w: np.ndarray) -> np.ndarray:
     return w[:, 2:] / np.pi * [1, -2]
 
 
-def part_of(
+def problem_of(
     scene: Scene,
     glossy: np.ndarray,
     materials: np.ndarray,
     functions: list[Callable],
     lighting: prt.CubemapLighting,
-) -> FactoredVisibility:
-    """The part that says which vertices are glossy, in frames turned at random; nothing is visible from them."""
-    tables = np.stack([f(table_directions()).reshape(128, 128, 2) for f in functions])
-    along = np.random.default_rng(3).normal(size=(len(glossy), 3)).astype(np.float32)
-    normals = scene.normals[glossy]
-    turn = frames(orthogonalise(along, normals), normals)
-    bits = np.zeros((scene.n_vertices, lighting.n_directions // 32), np.uint32)
-    return FactoredVisibility(
-        bits, scene.normals, lighting, glossy, turn, materials, tables.astype(np.float32)
+    max_depth: int,
+) -> Problem:
+    """Some vertices are glossy, in frames turned at random; of their BRDFs only the incident factors matter."""
+    grid = DirectionGrid(256, 512)  # as good as the functions themselves
+    factors = tuple(
+        BrdfFactors(
+            grid,
+            np.zeros(1),
+            f(grid.directions).T.astype(np.float32),
+            np.zeros((2, 1, len(grid.directions)), np.float32),
+        )
+        for f in functions
     )
+    material = np.full(scene.n_vertices, -1)
+    material[glossy] = materials
+    along = np.random.default_rng(3).normal(size=(len(glossy), 3)).astype(np.float32)
+    tangents = np.zeros_like(scene.normals)
+    tangents[glossy] = orthogonalise(along, scene.normals[glossy])
+    reflection = InOutFactors(scene.albedo, tangents, scene.normals, material, factors)
+    return Problem(scene, lighting, mesh_vertices(scene), reflection, max_depth=max_depth)
 
 
 @pytest.mark.parametrize("max_depth", [3, 5])
 def test_white_light_is_that_of_path_transport(grey_scene, max_depth):
     lighting, points = prt.CubemapLighting(4), vertex_points(grey_scene)
     glossy = np.arange(0, grey_scene.n_vertices, 2)
-    part = part_of(grey_scene, glossy, np.zeros_like(glossy), [lobes], lighting)
+    problem = problem_of(grey_scene, glossy, np.zeros_like(glossy), [lobes], lighting, max_depth)
     rng = np.random.default_rng(1)
     ids = rng.integers(0, grey_scene.n_vertices, 500), rng.integers(0, lighting.n_directions, 500)
-    found = TermPaths(grey_scene.normalised, part, points, max_depth, 8, seed=5).elements(*ids)
+    found = TermPaths(problem, 8, seed=5).elements(*ids)
     known = PathSolver(
         grey_scene.normalised, lighting, points, "direction", max_depth, 8, 1, seed=5
     ).elements(*ids)
@@ -84,8 +97,8 @@ def test_a_cosine_gives_white_light(grey_scene):
     Up to the tables, which are coarse at the horizon: a path in a thousand may be far off, all together by 0.02%.
     """
     lighting, every = prt.CubemapLighting(4), np.arange(grey_scene.n_vertices)
-    part = part_of(grey_scene, every, np.zeros_like(every), [cosines], lighting)
-    found = TermPaths(grey_scene.normalised, part, vertex_points(grey_scene), 4, 2).rows(every).mean
+    problem = problem_of(grey_scene, every, np.zeros_like(every), [cosines], lighting, 4)
+    found = TermPaths(problem, 2).rows(every).mean
     white, same, other = np.moveaxis(found.astype(np.float64), -1, 0)
     assert np.count_nonzero(white) > 1000
     assert np.linalg.norm(same - white) < 0.01 * np.linalg.norm(white)
@@ -159,13 +172,14 @@ def test_under_a_bright_ceiling():
     turn = np.array(place.matrix)[:3, :3]
     texels, radiance = texels_beside(lighting.directions @ turn)
     glossy, materials, functions = np.array([0, 2, 3]), np.array([0, 1, 0]), [lobes, waves]
-    part = part_of(scene, glossy, materials, functions, lighting)
-    paths = TermPaths(scene.normalised, part, points, max_depth=3, spp=1 << 15)
+    problem = problem_of(scene, glossy, materials, functions, lighting, max_depth=3)
+    paths = TermPaths(problem, spp=1 << 15)
     found = paths.elements(np.repeat(np.arange(4), len(texels)), np.tile(texels, 4))
     mean, variance = (x.reshape(4, -1, 3).astype(np.float64) for x in (found.mean, found.variance))
     assert not mean[1, :, 1:].any()
     covered, weight = quadrature(scene, points.positions)
-    for i, material, frame in zip(glossy, materials, part.frames, strict=True):
+    turned = frames(problem.reflection.tangents[glossy], scene.normals[glossy])
+    for i, material, frame in zip(glossy, materials, turned, strict=True):
         local = covered[i] @ frame.T.astype(np.float64)
         known = radiance[:, None] * (weight[i] @ functions[material](local))  # [texel, term]
         sums, error = known.sum(axis=0), np.sqrt(variance[i, :, 1:].sum(axis=0))
