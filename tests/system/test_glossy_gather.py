@@ -107,8 +107,8 @@ def compared(
     """Indirect light of some vertices, all glossy or all not, by paths in a scene whose vertices are the same."""
     reflection = transport.reflection
     problem = Problem(seen, LIGHTING, mesh_vertices(seen), reflection, max_depth=max_depth)
-    assert problem.channels == 1
-    halves = [TermPaths(problem, spp, seed=10 + k).rows(vertices).mean for k in range(2)]
+    colours = problem.channels  # which are alike
+    halves = [TermPaths(problem, spp, seed=10 + k).rows(vertices).mean[..., ::colours] for k in range(2)]
     rows = vertices[:, None]
     if np.isin(vertices, reflection.glossy).all():
         rows = reflection.rows_of_each(vertices, 1 + TERMS)
