@@ -118,7 +118,8 @@ class FactoredVisibility(Operator):
 
     def _term_columns(self, texels: Ids) -> Floats:
         """Columns of the terms alone, (n_g * K, len(texels))."""
-        return self._term_values(np.arange(len(self.glossy)), np.asarray(texels)).reshape(-1, len(texels))
+        values = self._term_values(np.arange(len(self.glossy)), np.asarray(texels))
+        return values.reshape(len(self.glossy) * self.terms, len(texels))
 
     def relight(self, lighting: Floats) -> Floats:
         directions = np.ascontiguousarray(self.lighting.directions.T)

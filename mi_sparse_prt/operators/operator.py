@@ -241,12 +241,12 @@ class Masked(Operator):
     def rows(self, ids: Ids) -> Floats:
         every = np.arange(self.shape[1])
         kept = self._kept(np.repeat(ids, len(every)), np.tile(every, len(ids)))
-        return self.operator.rows(ids) * kept.reshape(len(ids), -1, 1)
+        return self.operator.rows(ids) * kept.reshape(len(ids), len(every), 1)
 
     def columns(self, ids: Ids) -> Floats:
         result = self.operator.columns(ids)
         kept = self._kept(np.repeat(self.points, len(ids)), np.tile(ids, len(self.points)))
-        result[self.points] *= kept.reshape(len(self.points), -1, 1)
+        result[self.points] *= kept.reshape(len(self.points), len(ids), 1)
         return result
 
     def relight(self, lighting: Floats) -> Floats:

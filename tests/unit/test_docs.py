@@ -13,8 +13,8 @@ import pytest
 import typer
 
 import mi_sparse_prt as prt
-from mi_sparse_prt import plugins
 from mi_sparse_prt.cli import app
+from mi_sparse_prt.plugins import classes
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -52,8 +52,7 @@ def test_every_plugin_is_in_the_reference():
     listed = re.findall(
         r"^\.\. plugin-manual:: (\w+)", (ROOT / "docs/reference/plugins.rst").read_text(), re.MULTILINE
     )
-    defined = [name for name, value in vars(plugins).items() if inspect.isclass(value)]
-    assert sorted(listed) == sorted(defined)
+    assert sorted(listed) == sorted(classes.__all__)
 
 
 @pytest.mark.parametrize("code", blocks("python"))
