@@ -79,8 +79,8 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
     operators = {
         name: operator_from_arrays(name, kinds, arrays, lighting) for name in kinds if "." not in name
     }
-    if attributes["basis"] not in ("direction", "texel"):
-        raise ValueError(f"basis {attributes['basis']!r} is unknown")
+    if attributes["basis"] not in ("direction", "texel") or not operators:
+        raise ValueError("no operators of a basis that is known")
     rows = reflection.row_count, lighting.size
     if len(reflection.albedo) != len(measurement) or any(
         operator.shape[:2] != rows for operator in operators.values()

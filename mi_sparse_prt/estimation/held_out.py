@@ -201,7 +201,8 @@ class _Estimator:
         found = []
         for first, second in (errors, values):
             own = first * second - variance  # [element, row, channel]
-            found.append(np.column_stack([_quadratic(gram, first, second, own), own.sum(axis=2)]))
+            of_rows = np.broadcast_to(own, (*own.shape[:2], 3)).sum(axis=2)  # one channel stands for three
+            found.append(np.column_stack([_quadratic(gram, first, second, own), of_rows]))
         return Sample(chosen.weights, *found)
 
     def _halves(self, chosen: Chosen) -> tuple[Doubles, Doubles]:

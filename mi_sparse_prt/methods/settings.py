@@ -110,7 +110,16 @@ class Settings:
     @property
     def plan(self) -> Plan | None:
         """The plan that the method stands for, None if it is to be chosen."""
-        return self.method if isinstance(self.method, Plan) else BY_NAME.get(self.method)
+        if isinstance(self.method, Plan):
+            return self.method
+        plan = BY_NAME.get(self.method)
+        return None if plan is None else self.with_shares(plan)
+
+    def with_shares(self, plan: Plan) -> Plan:
+        """A plan of finite elements; terms in the texel basis need shares of texels, pixels are nearer by them."""
+        needed = (self.view_dependent or self.measurement == "pixels") and self.basis == "texel"
+        needed = needed and plan.indirect == "gather"
+        return replace(plan, direct="edges") if needed else plan
 
     def of(self, plan: Plan) -> Settings:
         """These, with the samples and the resolution of the indirect light that a plan has."""

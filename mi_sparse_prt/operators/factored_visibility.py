@@ -241,7 +241,10 @@ class RowSelection(Operator):
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        return cls(arrays["operator"], arrays["place"])
+        operator, place = arrays["operator"], arrays["place"]
+        if len(place) and not 0 <= place.min() <= place.max() < operator.shape[0]:
+            raise ValueError("rows are selected that are not there")
+        return cls(operator, place)
 
 
 @numba.njit(fastmath=True, inline="always")

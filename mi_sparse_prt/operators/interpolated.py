@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -67,12 +68,12 @@ class Interpolated(Operator):
         return self._interpolate(self.dense.apply(x))
 
     def adjoint(self, y: Floats) -> Floats:
-        flat = self.weights.T @ np.asarray(y, np.float32).reshape(len(y), -1)
-        return self.dense.adjoint(flat.reshape(-1, *y.shape[1:]))
+        flat = self.weights.T @ np.asarray(y, np.float32).reshape(len(y), math.prod(y.shape[1:]))
+        return self.dense.adjoint(flat.reshape(len(flat), *y.shape[1:]))
 
     def _interpolate(self, dense: Floats) -> Floats:
         """Values (n_dense, ...) at all points."""
-        flat = self.weights @ dense.reshape(len(dense), -1)
+        flat = self.weights @ dense.reshape(len(dense), math.prod(dense.shape[1:]))
         return flat.reshape(len(flat), *dense.shape[1:])
 
     def take(self, ids: Ids) -> Interpolated:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import Bits, bits_at
+from mi_sparse_prt.core.bits import BITS, Bits, bits_at
 from mi_sparse_prt.core.threads import run_overlapped
 
 Ids = NDArray[np.integer]
@@ -264,7 +264,11 @@ class Masked(Operator):
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Any], lighting: Any) -> Self:
-        return cls(arrays["operator"], arrays["points"], arrays["open"])
+        operator, points, open = (arrays[name] for name in ("operator", "points", "open"))
+        n, m, _ = operator.shape
+        if open.shape != (len(points), -(-m // BITS)) or (np.diff(points, prepend=-1, append=n) <= 0).any():
+            raise ValueError("masks and the rows that they are of do not fit together")
+        return cls(operator, points, open)
 
     def _kept(self, rows: Ids, texels: Ids) -> NDArray[np.bool_]:
         """Whether elements at rows and texels, (m,) each, are kept."""

@@ -72,4 +72,7 @@ class SparseRows(Operator):
     def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
         count = sum(name.endswith("_indptr") for name in arrays)
         columns = lighting.size
-        return cls(tuple(sparse_from_arrays(f"channel_{c}", arrays, columns) for c in range(count)))
+        matrices = tuple(sparse_from_arrays(f"channel_{c}", arrays, columns) for c in range(count))
+        if count not in (1, 3) or len({matrix.shape for matrix in matrices}) > 1:
+            raise ValueError("sparse rows are neither of one channel nor of three that fit together")
+        return cls(matrices)

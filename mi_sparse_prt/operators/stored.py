@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.dense import Dense
-from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility, RowSelection
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.haar_rows import HaarRows
 from mi_sparse_prt.operators.interpolated import Interpolated
@@ -32,6 +32,7 @@ _KINDS: dict[str, type[Operator]] = {
         LowRank,
         Masked,
         MeanCosine,
+        RowSelection,
         SparseRows,
         Sum,
         Upsampled,

@@ -71,7 +71,10 @@ class Sum(Operator):
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
-        return cls(tuple(arrays[f"term_{i}"] for i in range(len(arrays))))
+        terms = tuple(arrays[f"term_{i}"] for i in range(len(arrays)))
+        if len({term.shape[:2] for term in terms}) != 1:
+            raise ValueError("terms of a sum do not fit together")
+        return cls(terms)
 
 
 def add(arrays: Any) -> Floats:

@@ -144,8 +144,7 @@ class Ranking:
 def ladder(settings: Settings) -> Ladder:
     """The plan of a method; with a target error, from the coarsest of its plans on."""
     if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
-        direct = "exact" if settings.basis == "direction" else "edges"
-        return Ladder([replace(plan, direct=direct) for plan in EFFORTS["gather"]])
+        return Ladder([settings.with_shares(plan) for plan in EFFORTS["gather"]])
     if settings.target_error is None or isinstance(settings.method, Plan):
         return Ladder([settings.plan])
-    return Ladder(EFFORTS.get(settings.method, (settings.plan,)))
+    return Ladder([settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))])

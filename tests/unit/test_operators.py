@@ -11,7 +11,6 @@ import scipy.sparse
 from conftest import made_up
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.operators import stored
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility, RowSelection
@@ -220,9 +219,6 @@ def test_columns_in_blocks_and_combined(operator, dense):
 
 
 def test_arrays_and_back(operator, dense):
-    if operator.kind not in stored._KINDS:
-        assert isinstance(operator, RowSelection)  # in memory only
-        return
     kinds, arrays = operator_arrays(operator, "part")
     back = operator_from_arrays("part", kinds, arrays, prt.CubemapLighting(4))
     assert type(back) is type(operator)
