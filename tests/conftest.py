@@ -13,7 +13,7 @@ import pytest
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
+from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.haar_rows import HaarRows
@@ -23,6 +23,7 @@ from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
 matplotlib.use("Agg")
@@ -198,6 +199,28 @@ def altered(transport: LightTransport, **changes: object) -> LightTransport:
         measurement=replace(transport.measurement, **measurement),
         **changes,
     )
+
+
+def problem_of(scene: Scene, transport: LightTransport, max_depth: int) -> Problem:
+    """What a matrix of a scene's vertices was to be."""
+    return Problem(
+        scene,
+        transport.emission,
+        mesh_vertices(scene),
+        transport.reflection,
+        transport.basis,
+        max_depth,
+    )
+
+
+def assert_same(a: LightTransport, b: LightTransport) -> None:
+    """Bit by bit: what files have of them, factors and attributes."""
+    (attributes, ours), (others, theirs) = a.stored(), b.stored()
+    assert attributes == others
+    assert ours.keys() == theirs.keys()
+    for name, array in ours.items():
+        assert (array.dtype, array.shape) == (theirs[name].dtype, theirs[name].shape), name
+        assert array.tobytes() == theirs[name].tobytes(), name
 
 
 @pytest.fixture(scope="session")
