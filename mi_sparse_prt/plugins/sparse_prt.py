@@ -76,7 +76,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "method": method,
             "basis": props.get("basis", "texel"),
             "max_depth": props.get("max_depth", 5),
-            "spp": props.get("precompute_spp") if props.has_property("precompute_spp") else None,
+            "spp": props.get("precompute_spp") if "precompute_spp" in props else None,
             "indirect_resolution": props.get("indirect_resolution", coarse) or None,
             "target_error": props.get("target_error", 0.0) or None,
             "strata": props.get("strata", 2),
