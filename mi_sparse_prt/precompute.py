@@ -11,13 +11,13 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.emitters import SceneEmitters
-from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
-from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_of
 from mi_sparse_prt.methods.lamps import gathered_lamps, path_traced_lamps
@@ -26,7 +26,7 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.candidates import Ladder, Ranking, ladder
 from mi_sparse_prt.planner.choice import Predicted
-from mi_sparse_prt.planner.forecast import forecast
+from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.reflection.surfaces import vertex_reflection
@@ -35,8 +35,7 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
-_OTHER_SEEDS = 1 << 20  # of held-out elements that decide ...
-_DIRECT_SEED = _OTHER_SEEDS << 1  # ... and of those that tell how good direct light alone is
+DECISION = 5  # spawn key of held-out elements that decide something
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 
 
@@ -126,17 +125,15 @@ def precompute(
         If an argument makes no sense, or the matrix or what a method needs for it would not fit into memory.
     """
     where = mesh_vertices(scene) if measurement is None else _of_scene(measurement, scene)
-    run = Run(
-        seed, progress=progress, checkpoint_folder=Path(checkpoint_folder) if checkpoint_folder else None
-    )
+    folder = Path(checkpoint_folder) if checkpoint_folder else None
+    run = Run(seed, progress=progress, checkpoint_folder=folder)
     if isinstance(lighting, SceneEmitters):
         if terms or harmonics is not None or target_error is not None:
             raise PrtError(
                 "lamps: terms, harmonics and target_error are for light from a cubemap; leave them out"
             )
-        return _lit_by_lamps(
-            Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth), method, spp, run
-        )
+        problem = Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth)
+        return _lit_by_lamps(problem, method, spp, run)
     settings = Settings(
         lighting.resolution,
         method,
@@ -152,36 +149,83 @@ def precompute(
         where.kind,
     )
     reset_peak_memory()
-    clock = run.clock
-    with clock.phase("setup"):
-        seen = (
-            vertex_reflection(scene, terms, harmonics) if settings.view_dependent else _diffuse(scene, where)
-        )
+    with run.clock.phase("setup"):
+        glossy = settings.view_dependent
+        seen = vertex_reflection(scene, terms, harmonics) if glossy else _diffuse(scene, where)
         problem = Problem(scene, lighting, where, seen, basis, max_depth)
-        direct = DirectSolver(scene.normalised, lighting, problem.points, basis, strata, seed)
-    reason = _no_indirect(problem, settings, clock)
-    proposals = _proposals(problem, direct, settings, reason is None, clock)
-    with clock.phase("pilot"):
-        expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
-    evaluation = Execution(problem, direct, settings, reason is None, run)
-    tried = _tried_direct(evaluation, proposals, problem, settings, clock)
-    if tried:
-        expected = forecast(problem, direct, settings, proposals.plan, reason is None, proposals.seconds)
-    if progress:
-        tqdm.write(_expectation(scene, lighting, expected))
-    parts = _attempted(evaluation, proposals, tried, problem, settings, clock)
-    transport = evaluation.matrix(parts)
-    with clock.phase("held_out"):
-        error = held_out_error(problem, transport, seed)
-    _warn_if_missed(error, target_error, proposals.too_long)
-    transport.report.update(
-        _evaluated(parts, problem.points, lighting, _skipped(scene, reason))
-        | {"estimated_error": error, "plans": proposals.report(), "forecast": expected}
-        | {"plan": proposals.plan.report()}
-        | _costs(transport, clock)
-        | _inputs(problem, settings.of(proposals.plan))
-    )
-    return transport
+        direct = DirectSolver(problem, strata, seed)
+    return _Attempts(direct, settings, run).matrix()
+
+
+class _Attempts:
+    """One plan after another until a target error is met; the first one, where there is no target."""
+
+    def __init__(self, direct: DirectSolver, settings: Settings, run: Run) -> None:
+        self._direct, self._problem, self._settings, self._run = direct, direct.problem, settings, run
+        self._dark = _no_indirect(direct.problem, settings, run.clock)
+        self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
+        self._execution = Execution(direct, settings, self._dark is None, run)
+
+    def matrix(self) -> LightTransport:
+        """The matrix of the last attempt, with its report."""
+        run, problem, target = self._run, self._problem, self._settings.target_error
+        expected = self._forecast()
+        first = self._direct_light()
+        if first:
+            expected = self._forecast()
+        if run.progress:
+            tqdm.write(_expectation(problem, expected))
+        parts = self._evaluated(first)
+        transport, plan = matrix_of(problem, parts), self._proposals.plan
+        with run.clock.phase("held_out"):
+            error = held_out_error(problem, transport, run.seed)
+        _warn_if_missed(error, target, self._proposals.too_long)
+        transport.report.update(
+            _account(parts, problem, _skipped(problem.scene, self._dark))
+            | {"estimated_error": error.report(), "plans": self._proposals.report()}
+            | {"forecast": expected._asdict(), "plan": plan.report()}
+            | _costs(transport, run.clock)
+            | _inputs(problem, self._settings.of(plan))
+        )
+        return transport
+
+    def _forecast(self) -> Forecast:
+        with self._run.clock.phase("pilot"):
+            proposals, indirect = self._proposals, self._dark is None
+            return forecast(self._direct, self._settings, proposals.plan, indirect, proposals.seconds)
+
+    def _direct_light(self) -> list[MethodResult]:
+        """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
+        proposals, problem = self._proposals, self._problem
+        if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
+            return []
+        parts = self._execution.direct_light(how)
+        with self._run.clock.phase("held_out"):
+            only = replace(problem, max_depth=2)
+            stream = random_stream(self._run.seed, DECISION, 0)
+            found = held_out_error(only, matrix_of(problem, parts), stream)
+        proposals.judged(how, found.total)
+        return [parts]
+
+    def _evaluated(self, before: list[MethodResult]) -> MethodResult:
+        """The last of the attempts.
+
+        Each is judged by held-out elements of its own; those of the report decide nothing. What was evaluated before
+        counts as well.
+        """
+        proposals, target, attempts = self._proposals, self._settings.target_error, list(before)
+        attempts.append(self._execution.parts(proposals.plan))
+        while target is not None:
+            with self._run.clock.phase("held_out"):
+                transport = matrix_of(self._problem, attempts[-1])
+                stream = random_stream(self._run.seed, DECISION, len(attempts))
+                found = held_out_error(self._problem, transport, stream, target).total
+            if found <= target or not proposals.after(found):
+                break
+            if self._run.progress:
+                tqdm.write(_again(found, proposals.plan, proposals.seconds))
+            attempts.append(self._execution.parts(proposals.plan))
+        return _with_costs_of(attempts)
 
 
 def _of_scene(measurement: Measurement, scene: Scene) -> Measurement:
@@ -217,7 +261,7 @@ def _lit_by_lamps(problem: Problem, method: str | Plan, spp: int | None, run: Ru
             "elements": parts.elements,
             "rays": parts.rays,
             "skipped": parts.skipped,
-            "estimated_error": error,
+            "estimated_error": error.report(),
             "seed": run.seed,
             "parameters": {
                 "method": name,
@@ -251,7 +295,7 @@ def _skipped(scene: Scene, reason: str | None) -> list[str]:
 
 
 def _proposals(
-    problem: Problem, direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
+    direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
 ) -> Ladder | Ranking:
     """The plans to try, measured and ranked where the method leaves them open."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
@@ -259,49 +303,8 @@ def _proposals(
     elif settings.method != "auto" or settings.view_dependent or settings.measurement != "vertices":
         return ladder(settings)
     with clock.phase("plan"):
-        costs = measure(problem, direct, settings, indirect)
+        costs = measure(direct, settings, indirect)
     return Ranking(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
-
-
-def _tried_direct(
-    evaluation: Execution, proposals: Ladder | Ranking, problem: Problem, settings: Settings, clock: Stopwatch
-) -> list[MethodResult]:
-    """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
-    if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
-        return []
-    parts = evaluation.direct_light(how)
-    with clock.phase("held_out"):
-        only = replace(problem, max_depth=2)
-        found = held_out_error(only, evaluation.matrix(parts), settings.seed + _DIRECT_SEED)
-    proposals.judged(how, found["total"])
-    return [parts]
-
-
-def _attempted(
-    evaluation: Execution,
-    proposals: Ladder | Ranking,
-    tried: list[MethodResult],
-    problem: Problem,
-    settings: Settings,
-    clock: Stopwatch,
-) -> MethodResult:
-    """The first of some attempts that meets the target error, or the last; where there is no target, the first.
-
-    Each attempt is judged by held-out elements of its own; those of the report decide nothing. What was evaluated
-    before counts as well.
-    """
-    attempts = [*tried, evaluation.parts(proposals.plan)]
-    while settings.target_error is not None:
-        with clock.phase("held_out"):
-            transport = evaluation.matrix(attempts[-1])
-            other = settings.seed + _OTHER_SEEDS + len(attempts) - 1
-            found = held_out_error(problem, transport, other, settings.target_error)
-        if found["total"] <= settings.target_error or not proposals.after(found["total"]):
-            break
-        if evaluation.progress:
-            tqdm.write(_again(found["total"], proposals.plan, proposals.seconds))
-        attempts.append(evaluation.parts(proposals.plan))
-    return _with_costs_of(attempts)
 
 
 def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
@@ -321,24 +324,24 @@ def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
     )
 
 
-def _warn_if_missed(error: dict[str, Any], target: float | None, too_long: Predicted | None) -> None:
-    if target is None or error["total"] - 2 * error["standard_error"]["total"] <= target:
+def _warn_if_missed(error: HeldOutError, target: float | None, too_long: Predicted | None) -> None:
+    if target is None or error.total - 2 * error.standard_error["total"] <= target:
         return
     more = ""
     if too_long is not None:
         method = {"paths": "brute_force"}.get(too_long.plan.indirect, too_long.plan.indirect)
         more = f'; method="{method}" would meet it in about {too_long.seconds / 60:.0f} min'
     warnings.warn(
-        f"the target error {target:g} was not met: the estimate is {error['total']:.3g}{more}",
+        f"the target error {target:g} was not met: the estimate is {error.total:.3g}{more}",
         PrtWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
 
 
-def _expectation(scene: Scene, lighting: CubemapLighting, expected: dict[str, float]) -> str:
+def _expectation(problem: Problem, expected: Forecast) -> str:
     return (
-        f"{scene.n_vertices} vertices x {lighting.n_directions} directions: about {expected['seconds']:.0f} s "
-        f"and {expected['bytes'] / 1e6:.0f} MB"
+        f"{problem.scene.n_vertices} vertices x {problem.emission.n_directions} directions: "
+        f"about {expected.seconds:.0f} s and {expected.bytes / 1e6:.0f} MB"
     )
 
 
@@ -369,13 +372,11 @@ def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _evaluated(
-    parts: MethodResult, points: Points, lighting: CubemapLighting, skipped: list[str]
-) -> dict[str, Any]:
+def _account(parts: MethodResult, problem: Problem, skipped: list[str]) -> dict[str, Any]:
     """What was evaluated and what was not, for the report."""
-    above = share_above_horizon(points, lighting)
+    above = share_above_horizon(problem.points, problem.emission)
     return {
-        "elements_total": len(points) * lighting.n_directions,
+        "elements_total": len(problem.points) * problem.emission.n_directions,
         "elements_evaluated": parts.elements_evaluated,
         "elements": parts.elements,
         "rays": parts.rays,

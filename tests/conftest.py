@@ -3,7 +3,9 @@
 Pure helpers are imported (``from conftest import diffuse``), what is expensive comes as session fixtures.
 """
 
+import importlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -13,7 +15,10 @@ import pytest
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.estimation.element_sampling import Effort
+from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
+from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.haar_rows import HaarRows
@@ -23,7 +28,7 @@ from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.problem import Problem, diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 matplotlib.use("Agg")
@@ -211,6 +216,24 @@ def problem_of(scene: Scene, transport: LightTransport, max_depth: int) -> Probl
         transport.basis,
         max_depth,
     )
+
+
+def problem_at(
+    scene: Scene,
+    lighting: prt.CubemapLighting,
+    points: Points | None = None,
+    basis: str = "direction",
+    max_depth: int = 5,
+) -> Problem:
+    """Of a scene that is taken for diffuse: at its vertices, or at other points."""
+    problem = replace(diffuse_problem(scene, lighting, max_depth), basis=basis)
+    return problem if points is None else problem.at(points)
+
+
+def few_held_out(monkeypatch: pytest.MonkeyPatch, **effort: int) -> None:
+    """Precomputations whose error is not asked for find it with less effort."""
+    pipeline = importlib.import_module("mi_sparse_prt.precompute")  # the package's own is the function
+    monkeypatch.setattr(pipeline, "held_out_error", partial(held_out_error, effort=Effort(**effort)))
 
 
 def assert_same(a: LightTransport, b: LightTransport) -> None:

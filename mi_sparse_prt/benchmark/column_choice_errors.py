@@ -19,7 +19,7 @@ from mi_sparse_prt.core.metrics import relative_l2_of_sample
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.neighbours import radius_neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods.huang2010 import LEAST_NEIGHBOURS, MOST_NEIGHBOURS, RADIUS, RELATIVE_LAMBDA
+from mi_sparse_prt.methods.huang2010 import Huang2010Options
 from mi_sparse_prt.reconstruction.interpolation_weights import inverse_distance_weights, linear_weights
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
@@ -28,7 +28,9 @@ from mi_sparse_prt.sampling.features import choose_features
 from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense, choose_weighted
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 
+PAPER = Huang2010Options()
 ROWS = 0.25  # Figure 5
 INTERPOLATED_FROM = 12  # neighbours, as many as method="sparse" has
 
@@ -165,7 +167,7 @@ def compare_choices(
         raise PrtError(f"n_vertices is {n_vertices}: give 1 or more")
     surface = _surface(scene, lighting, mesh)
     n, count = len(surface.positions), max(1, round(SHARE * lighting.n_directions))
-    sampling = SpatialSampling(ROWS, radius=RADIUS)
+    sampling = SpatialSampling(ROWS, radius=PAPER.radius)
     by_rank = choose_dense(surface.positions, surface.keys, lambda ids: surface.bits[ids], sampling, seed).ids
     at_random = choose_weighted(np.ones(n), surface.keys, len(by_rank), seed + 1)
     sample = choose_weighted(np.ones(n), surface.keys, n_vertices, seed + 2)
@@ -225,7 +227,7 @@ def plot_choices(report: dict[str, Any]) -> Figure:
 
 def _surface(scene: Scene, lighting: CubemapLighting, name: str) -> _Surface:
     inside, points = mesh_named(scene, name).vertices, vertex_points(scene)
-    direct = DirectSolver(scene.normalised, lighting, points)
+    direct = DirectSolver(diffuse_problem(scene, lighting))
     bits = trace_visibility(direct, np.arange(inside.start, inside.stop, dtype=np.uint32))
     return _Surface(
         scene.normalised_positions[inside], scene.normals[inside], points.keys[inside], bits, lighting
@@ -238,9 +240,9 @@ def _local(surface: _Surface, sample: NDArray[np.int64], dense: NDArray[np.int64
         raise PrtError(
             f"all {len(sample)} vertices of the sample are dense: draw more, or take a larger mesh"
         )
-    found = radius_neighbours(p[sparse], p[dense], np.inf, MOST_NEIGHBOURS)
-    beyond = found.distances > RADIUS
-    beyond[:, :LEAST_NEIGHBOURS] = False
+    found = radius_neighbours(p[sparse], p[dense], np.inf, PAPER.most_neighbours)
+    beyond = found.distances > PAPER.radius
+    beyond[:, : PAPER.least_neighbours] = False
     near = np.where(beyond, -1, found.ids).astype(np.int32)
     return _Local(surface.rows(sparse), sparse, dense, surface.rows(dense), surface.features(dense), near)
 
@@ -262,7 +264,7 @@ def _fitted(local: _Local, directions: NDArray[np.int32], seconds: float) -> _Re
     """L1 weights of the neighbours from the exact values at directions (n, s), -1 where there are fewer."""
     known = directions >= 0
     equations = normal_equations(local.rows, local.near, directions, values_at(local.exact, directions))
-    weights = l1_fit(*equations, RELATIVE_LAMBDA).weights
+    weights = l1_fit(*equations, PAPER.relative_lambda).weights
     # no directions, no equations: the neighbours' mean, as in huang2010
     alone = ~known.any(axis=1)
     present = local.near[alone] >= 0

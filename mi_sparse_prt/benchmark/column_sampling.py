@@ -20,12 +20,11 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import Dense
 from mi_sparse_prt.methods.execution import matrix_of
-from mi_sparse_prt.methods.huang2010 import huang2010_parts
+from mi_sparse_prt.methods.huang2010 import Huang2010Options, huang2010_parts
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -300,21 +299,19 @@ def precompute_with_columns(
     LightTransport
         In the direction basis. ``report`` has ``seconds``, ``elements_total`` and ``elements_evaluated``.
     """
-    clock = Stopwatch()
-    with clock.phase("setup"):
-        points = vertex_points(scene)
-        direct = DirectSolver(scene.normalised, lighting, points)
-        channels = 1 if scene.grey else 3
-        paths = PathSolver(scene.normalised, lighting, points, "direction", max_depth, spp, channels, seed)
+    run = Run(seed, progress=progress)
+    with run.clock.phase("setup"):
+        problem = diffuse_problem(scene, lighting, max_depth)
+        direct, paths = DirectSolver(problem), PathSolver(problem, spp, seed)
 
     def columns(dense: Dense, mean: NDArray[np.float32]) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
         return columns_of_nearest(scene, dense, mean, CHOICES[choice], seed)
 
-    parts = huang2010_parts(scene, direct, paths, seed, clock, progress, columns=columns)
-    transport = matrix_of(diffuse_problem(scene, lighting, max_depth), parts)
+    parts = huang2010_parts(direct, paths, run, Huang2010Options(columns=columns))
+    transport = matrix_of(problem, parts)
     transport.report.update(
-        seconds=clock.report(),
-        elements_total=len(points) * lighting.n_directions,
+        seconds=run.clock.report(),
+        elements_total=len(problem.points) * lighting.n_directions,
         elements_evaluated=parts.elements_evaluated,
     )
     return transport

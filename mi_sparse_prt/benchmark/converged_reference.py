@@ -27,6 +27,7 @@ from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 MAX_DEPTH = 5
@@ -107,6 +108,7 @@ class Reference:
         self, scene: Scene, lighting: CubemapLighting, progress: bool, effort: ReferenceEffort = CONVERGED
     ) -> None:
         self.scene, self.lighting, self.points = scene, lighting, vertex_points(scene)
+        self._problem = diffuse_problem(scene, lighting, MAX_DEPTH)
         self._meshes = {mesh.name: mesh.vertices for mesh in scene.meshes}
         self._sizes = {name: inside.stop - inside.start for name, inside in self._meshes.items()}
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3].astype(np.float64)
@@ -133,15 +135,11 @@ class Reference:
 
     def paths(self, spp: int, seed: int) -> PathSolver:
         """A solver for indirect light at the scene's vertices."""
-        return PathSolver(*self._problem(spp, seed))
+        return PathSolver(self._problem, spp, seed)
 
     def adjoint(self, spp: int) -> AdjointSolver:
         """Another one, for whole rows."""
-        return AdjointSolver(*self._problem(spp, 0))
-
-    def _problem(self, spp: int, seed: int) -> tuple[Any, ...]:
-        channels = self._albedo.shape[1]
-        return self.scene.normalised, self.lighting, self.points, "direction", MAX_DEPTH, spp, channels, seed
+        return AdjointSolver(self._problem, spp)
 
     def time_paths(self, spp: int) -> RowsTime:
         """Seconds of all indirect elements by so many paths each, a wavefront at a time."""
@@ -263,7 +261,7 @@ class Reference:
         }
 
     def _trace_direct(self) -> tuple[float, NDArray[Any]]:
-        solver = DirectSolver(self.scene.normalised, self.lighting, self.points)
+        solver = DirectSolver(self._problem)
         stored = solver.row_storage(len(self.points))
         solver.rows(np.arange(min(16, len(stored)), dtype=np.uint32))  # compiles
 

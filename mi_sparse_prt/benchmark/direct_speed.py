@@ -17,6 +17,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 
 
 class BareOcclusion:
@@ -78,7 +79,7 @@ def measure_direct(
         The matrix's bits.
     """
     points = vertex_points(scene)
-    solver = DirectSolver(scene.normalised, lighting, points)
+    solver = DirectSolver(diffuse_problem(scene, lighting))
     bare = BareOcclusion(scene.normalised, lighting, points)
     blocks = [(a, min(a + solver.block_size, len(points))) for a in range(0, len(points), solver.block_size)]
     bits = solver.row_storage(len(points)).astype(np.uint32, copy=False)  # a fact, told to mypy

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from mi_sparse_prt.benchmark.relit_reference import environments_of, path_traced
 from mi_sparse_prt.benchmark.vertex_pictures import COLORMAP, vertex_picture
 from mi_sparse_prt.core.metrics import relative_l2
-from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
-from mi_sparse_prt.methods.sparse import DENSE, POWER, RADIUS
+from mi_sparse_prt.methods.sparse import SparseOptions
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.matrix_figures import picture_row, tonemapped
 from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices
@@ -109,10 +109,10 @@ class MethodPictures:
 
 def _choose_dense(scene: Scene, direct: Visibility) -> Dense:
     """Dense vertices as ``method="sparse"`` chooses them by rank: a few rays, so they are chosen again."""
-    solver = DirectSolver(scene.normalised, direct.lighting, vertex_points(scene))
-    sampler = DenseSampler(scene, solver, AngularGrid(direct.lighting), Stopwatch())
+    solver = DirectSolver(diffuse_problem(scene, direct.lighting))
+    sampler = DenseSampler(solver, AngularGrid(direct.lighting), Run())
     for mesh in scene.meshes:
-        sampler.choose(mesh, DENSE, RADIUS, 0, POWER)
+        sampler.choose(mesh, SparseOptions().spatial)
     return sampler.dense()
 
 

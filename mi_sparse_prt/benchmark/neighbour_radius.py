@@ -15,20 +15,22 @@ from mi_sparse_prt.benchmark.least_squares import least_squares_fit
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import relative_l2_from_squares
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
-from mi_sparse_prt.methods.huang2010 import DENSE_GROUND, RADIUS, RELATIVE_LAMBDA
+from mi_sparse_prt.methods.huang2010 import Huang2010Options
 from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import choose_features
-from mi_sparse_prt.sampling.spatial import choose_weighted
+from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_weighted
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 
+PAPER = Huang2010Options()
 CURVES = {"least_squares": "least squares", "l1": "L1", "full": "full: least squares on all directions"}
 
 
@@ -138,7 +140,7 @@ def error_against_radius(
         "vertices": len(samples.exact),
         "dense_vertices": len(samples.dense),
         "directions_asked": directions,
-        "relative_lambda": RELATIVE_LAMBDA,
+        "relative_lambda": PAPER.relative_lambda,
         "radii": [float(radius) for radius in radii],
         **{name: [at[name] for at in found] for name in means},
         **curves,
@@ -167,9 +169,9 @@ def plot_error_against_radius(report: dict[str, Any]) -> Figure:
 def _draw_samples(scene: Scene, lighting: CubemapLighting, mesh: Mesh, n_vertices: int) -> _Samples:
     """Dense rows as phase 1 of ``huang2010`` finds them, and exact rows of some other vertices."""
     points = vertex_points(scene)
-    direct = DirectSolver(scene.normalised, lighting, points)
-    sampler = DenseSampler(scene, direct, AngularGrid(lighting), Stopwatch())
-    sampler.choose(mesh, DENSE_GROUND, RADIUS, seed=0)
+    direct = DirectSolver(diffuse_problem(scene, lighting))
+    sampler = DenseSampler(direct, AngularGrid(lighting), Run())
+    sampler.choose(mesh, SpatialSampling(PAPER.ground, radius=PAPER.radius))
     dense = sampler.dense()
     others = np.setdiff1d(np.arange(mesh.vertices.start, mesh.vertices.stop), dense.ids)
     if not len(others):
@@ -224,5 +226,5 @@ def _fit_weights(
     few = normal_equations(samples.dense, near[None], chosen, values)
     gram = samples.products[np.ix_(near, near)]
     full = gram[None], samples.projections[vertex, near][None], samples.norms[[vertex]]
-    fits = least_squares_fit(*few), l1_fit(*few, RELATIVE_LAMBDA), least_squares_fit(*full)
+    fits = least_squares_fit(*few), l1_fit(*few, PAPER.relative_lambda), least_squares_fit(*full)
     return np.concatenate([fit.weights for fit in fits]), int((chosen >= 0).sum())

@@ -22,6 +22,7 @@ from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 FOLDER = "envmaps"  # beside a scene's file
@@ -146,14 +147,13 @@ def _sums(
     owners = np.repeat(np.asarray(vertices, np.int64), paths)
     keys = mix(points.keys[owners] + np.tile(np.arange(paths, dtype=np.uint64), len(vertices)))
     copies = Points(points.positions[owners], points.normals[owners], points.offset_normals[owners], keys)
-    channels = 1 if scene.grey else 3
-    solver = PathSolver(
-        scene.normalised, lighting, copies, "direction", MAX_DEPTH, spp=1, channels=channels, seed=seed
-    )
+    solver = PathSolver(diffuse_problem(scene, lighting, MAX_DEPTH).at(copies), spp=1, seed=seed)
     values = solver.elements(np.arange(len(owners), dtype=np.uint32), texels.astype(np.uint32)).mean
     n = lighting.n_directions
     where = np.repeat(np.arange(len(vertices)), paths) * n + texels
-    sums = [np.bincount(where, values[:, c], len(vertices) * n).reshape(-1, n) for c in range(channels)]
+    sums = [
+        np.bincount(where, values[:, c], len(vertices) * n).reshape(-1, n) for c in range(solver.channels)
+    ]
     return np.stack(sums, axis=-1)
 
 

@@ -15,7 +15,6 @@ from mi_sparse_prt.benchmark.measuring import report_header, timed
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -85,8 +84,8 @@ def measure_paths(scene: Scene, lighting: CubemapLighting, repeats: int) -> dict
         included; scattered elements find the kernel of the rows) and ``kernels`` of that run.
         ``whole_matrix_seconds`` is what all rows would take.
     """
-    points, channels = vertex_points(scene), 1 if scene.grey else 3
-    solver = PathSolver(scene.normalised, lighting, points, "direction", MAX_DEPTH, SPP, channels)
+    problem = diffuse_problem(scene, lighting, MAX_DEPTH)
+    points, solver = problem.points, PathSolver(problem, SPP)
     rng = np.random.default_rng(0)
     n_rows = min(len(points), max(1, round(WAVEFRONTS * LANES / (SPP * lighting.n_directions))))
     rows = np.sort(rng.choice(len(points), n_rows, replace=False)).astype(np.uint32)
@@ -98,7 +97,7 @@ def measure_paths(scene: Scene, lighting: CubemapLighting, repeats: int) -> dict
         "scattered": lambda: solver.elements(vertices, texels),
     }
     paths = n_elements * SPP
-    report: dict[str, Any] = {"max_depth": MAX_DEPTH, "spp": SPP, "channels": channels, "paths": paths}
+    report: dict[str, Any] = {"max_depth": MAX_DEPTH, "spp": SPP, "channels": solver.channels, "paths": paths}
     report["blocks"] = -(-paths // LANES)
     for name, way in ways.items():
         first, kernels = timed(launched_kernels, way)

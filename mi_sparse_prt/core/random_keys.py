@@ -18,6 +18,26 @@ from numpy.typing import NDArray
 GOLDEN_RATIO = 0x9E3779B97F4A7C15  # 2^64 / golden ratio, odd: the step from state to state
 
 
+def random_stream(seed: int | np.random.SeedSequence, *key: int) -> np.random.SeedSequence:
+    """Random numbers of one phase of a run, of whichever other phases there are and in whatever order.
+
+    Parameters
+    ----------
+    seed : int or SeedSequence
+        Of the run, or of a phase that has phases of its own.
+    key : integers
+        The spawn key of the phase.
+    """
+    if isinstance(seed, np.random.SeedSequence):
+        return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, *key))
+    return np.random.SeedSequence(seed, spawn_key=key)
+
+
+def element_seeds(stream: np.random.SeedSequence, count: int) -> list[int]:
+    """Seeds of ``random_generator``: independent estimates of the same elements."""
+    return [int(seed) for seed in random_stream(stream, 0).generate_state(count, np.uint64)]
+
+
 def finalise(x: Any) -> Any:
     """SplitMix64's finaliser: a bijection of 64-bit words, NumPy's or Dr.Jit's, all bits scattered."""
     x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9

@@ -18,17 +18,12 @@ from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.transport import LightTransport
 
-RAYS = 0.002  # of the elements of a mesh, for direct light ...
-FEWEST_RAYS = 1 << 16  # ... but as many as this, or a quarter of the mesh
 FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
 AROUND = 24  # texels: 5 x 5 without the middle
 NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
 BELOW_HORIZON = 0.25  # added to the cosine where direct light is not bits alone: it may be wrong there, too
 FEW = 8  # times fewer elements in that case: hardly one is without an error
 
-PATHS = 6144  # elements for indirect light, shared out among meshes; at most 1 / 16 of a mesh ...
-FEW_PATHS = 512  # ... and as many as this where there are many meshes
-FEWEST_PATHS = 64  # ... or as many as this, where a mesh is small
 POOL = 8  # times as many, of which these are drawn
 EVEN = 0.2  # of them drawn without regard to the light that the matrix has there
 
@@ -36,6 +31,43 @@ MEAN_COSINE = 0.25  # of max(0, n . w) over the sphere
 BLOCK = 1 << 12  # vertices at a time: some hundred trials each
 
 _NO_EDGES = np.zeros((0, 0), np.uint32), np.zeros((0, 0), np.int32)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much of a matrix is held out.
+
+    Attributes
+    ----------
+    rays : float
+        Of the elements of a mesh, for direct light that is bits; but as many as ``fewest_rays``, or a quarter of it.
+    fewest_rays : int
+    paths : int
+        Elements for indirect light, shared out among meshes: as many as ``few_paths`` where there are many of these, at
+        most 1 / 16 of a mesh, but as many as ``fewest_paths`` where one is small.
+    few_paths, fewest_paths : int
+    spp : int
+        Paths for each of these.
+    strata : int
+        Texel basis: shadow rays per axis of a texel.
+    """
+
+    rays: float = 0.002
+    fewest_rays: int = 1 << 16
+    paths: int = 6144
+    few_paths: int = 512
+    fewest_paths: int = 64
+    spp: int = 512
+    strata: int = 4
+
+    def rays_of(self, total: int) -> float:
+        """How many elements of so many are drawn for direct light that is bits, about."""
+        return max(self.rays * total, min(total / 4, self.fewest_rays))
+
+    def paths_of(self, total: int, n_meshes: int, part: float = 1.0) -> int:
+        """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""
+        share = max(self.paths // n_meshes, self.few_paths)
+        return max(round(part * min(share, total // 16)), min(self.fewest_paths, total))
 
 
 @dataclass(frozen=True)
@@ -60,7 +92,8 @@ def for_direct_light(
     normals: NDArray[np.float32],
     inside: slice,
     rng: np.random.Generator,
-    effort: float = 1.0,
+    effort: Effort,
+    part: float = 1.0,
 ) -> Chosen:
     """Draw elements for direct light, at all vertices of a mesh: a few of them may hold most of the error.
 
@@ -75,11 +108,12 @@ def for_direct_light(
     inside : slice
         The vertices of the mesh.
     rng : numpy.random.Generator
-    effort : float
-        Of the usual number of elements.
+    effort : Effort
+    part : float
+        Of these elements.
     """
     lighting, direct = transport.lighting, transport.operators["direct"]
-    rays = effort * rays_of((inside.stop - inside.start) * lighting.n_directions)
+    rays = part * effort.rays_of((inside.stop - inside.start) * lighting.n_directions)
     floor, edges = 0.0, _NO_EDGES
     if not direct.dark_below_horizon:
         rays, floor = rays / FEW, BELOW_HORIZON
@@ -91,19 +125,8 @@ def for_direct_light(
     return _by_cosine(lighting, normals[inside], inside.start, rays, floor, edges, rng)
 
 
-def rays_of(total: int) -> float:
-    """How many elements of so many are drawn for direct light that is bits, about."""
-    return max(RAYS * total, min(total / 4, FEWEST_RAYS))
-
-
-def paths_of(total: int, n_meshes: int, effort: float = 1.0) -> int:
-    """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""
-    share = max(PATHS // n_meshes, FEW_PATHS)
-    return max(round(effort * min(share, total // 16)), min(FEWEST_PATHS, total))
-
-
 def for_indirect_light(
-    transport: LightTransport, inside: slice, rng: np.random.Generator, effort: float = 1.0
+    transport: LightTransport, inside: slice, rng: np.random.Generator, effort: Effort, part: float = 1.0
 ) -> Chosen:
     """Draw elements for indirect light, where the matrix has most of it: there its errors and the paths' noise are.
 
@@ -114,12 +137,13 @@ def for_indirect_light(
     inside : slice
         The vertices of the mesh.
     rng : numpy.random.Generator
-    effort : float
-        Of the usual number of elements.
+    effort : Effort
+    part : float
+        Of these elements.
     """
     indirect = transport.operators["indirect"]
     total = (inside.stop - inside.start) * transport.lighting.n_directions
-    count = paths_of(total, len(transport.meshes), effort)
+    count = effort.paths_of(total, len(transport.meshes), part)
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.estimation.element_sampling import Chosen, for_direct_light, for_indirect_light
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.estimation.element_sampling import Chosen, Effort, for_direct_light, for_indirect_light
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -29,9 +30,8 @@ from mi_sparse_prt.transport import LightTransport
 
 Doubles = NDArray[np.float64]
 
-SPP = 512
-STRATA = 4  # shadow rays per axis of a texel
 ROUNDING = 1e-5  # relative errors below are those of float32
+HELD_OUT = 1  # spawn key
 ROUND = 0.25  # of the elements: these mostly tell whether a target is met
 
 
@@ -56,9 +56,43 @@ class Sample:
 Samples = dict[tuple[str, str], Sample]  # by the names of a mesh and of a part
 
 
+@dataclass(frozen=True)
+class HeldOutError:
+    """Relative L2 error of a matrix, as estimated.
+
+    Attributes
+    ----------
+    total : float
+        Of radiance, squares averaged over views by their cosine.
+    meshes : dict
+        The same of each mesh, by name.
+    standard_error : dict
+        ``total`` and ``meshes`` again, from the spread between elements; where no element is wrong, as if an average
+        one were.
+    elements : int
+        That were drawn.
+    terms : list of float
+        Of glossy scenes: of each term's rows.
+    """
+
+    total: float
+    meshes: dict[str, float]
+    standard_error: dict[str, Any]
+    elements: int
+    terms: list[float]
+
+    def report(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {name: value for name, value in vars(self).items() if name != "terms" or value}
+
+
 def held_out_error(
-    problem: Problem, transport: LightTransport, seed: int, target: float | None = None
-) -> dict[str, Any]:
+    problem: Problem,
+    transport: LightTransport,
+    seed: int | np.random.SeedSequence,
+    target: float | None = None,
+    effort: Effort = Effort(),  # noqa: B008  frozen
+) -> HeldOutError:
     """Estimate the relative L2 error of a matrix.
 
     Parameters
@@ -67,28 +101,22 @@ def held_out_error(
         Where the matrix has no indirect light, none is expected.
     transport : LightTransport
         Rows in the order of the scene's vertices.
-    seed : int
+    seed : int or SeedSequence
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     target : float, optional
         Relative L2 error. If given, elements are drawn by the quarter until it is clear (2 standard errors) whether the
         error is above it.
-
-    Returns
-    -------
-    dict
-        ``total`` (relative L2 of radiance, squares averaged over views by their cosine), ``meshes`` (name -> relative
-        L2), ``standard_error`` (``total`` and ``meshes`` again, from the spread between elements; where no element is
-        wrong, as if an average one were), ``elements`` (how many were drawn), and of glossy scenes ``terms``: relative
-        L2 of each term's rows.
+    effort : Effort
     """
-    estimator, rng = _Estimator(problem, transport, seed), np.random.default_rng([seed, 1])
+    stream = random_stream(seed, HELD_OUT)
+    estimator, rng = _Estimator(problem, transport, effort, stream), np.random.default_rng(stream)
     if target is None:
         return estimate_errors(estimator.samples(rng, 1.0))
     samples: Samples = {}
     for _ in range(round(1 / ROUND)):
         samples = _together(samples, estimator.samples(rng, ROUND))
         found = estimate_errors(samples)
-        if abs(found["total"] - target) > 2 * found["standard_error"]["total"]:
+        if abs(found.total - target) > 2 * found.standard_error["total"]:
             break
     return found
 
@@ -103,55 +131,46 @@ def _together(first: Samples, second: Samples) -> Samples:
     }
 
 
-def estimate_errors(samples: Samples) -> dict[str, Any]:
+def estimate_errors(samples: Samples) -> HeldOutError:
     """Relative L2 errors and standard errors."""
     names = dict.fromkeys(name for name, _ in samples)
     meshes = {name: relative([sample for (of, _), sample in samples.items() if of == name]) for name in names}
     total = relative(list(samples.values()))
-    return {
-        "total": total[0],
-        "meshes": {name: value for name, (value, _) in meshes.items()},
-        "standard_error": {
-            "total": total[1],
-            "meshes": {name: error for name, (_, error) in meshes.items()},
-        },
-        "elements": sum(len(sample.weights) for sample in samples.values()),
-    } | _term_errors(list(samples.values()))
-
-
-def _term_errors(samples: list[Sample]) -> dict[str, list[float]]:
-    """``terms``, where any sample has them."""
-    rows = max(sample.squares.shape[1] for sample in samples)
-    if rows <= 2:
-        return {}
-    glossy = [sample for sample in samples if sample.squares.shape[1] == rows]
-    return {"terms": [relative(glossy, row)[0] for row in range(2, rows)]}
+    rows = max(sample.squares.shape[1] for sample in samples.values())
+    glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
+    return HeldOutError(
+        total[0],
+        {name: value for name, (value, _) in meshes.items()},
+        {"total": total[1], "meshes": {name: error for name, (_, error) in meshes.items()}},
+        sum(len(sample.weights) for sample in samples.values()),
+        [relative(glossy, row)[0] for row in range(2, rows)],
+    )
 
 
 class _Estimator:
     """Compares elements of a matrix with true ones."""
 
-    def __init__(self, problem: Problem, transport: LightTransport, seed: int) -> None:
-        self._problem, self._transport = problem, transport
+    def __init__(
+        self, problem: Problem, transport: LightTransport, effort: Effort, stream: np.random.SeedSequence
+    ) -> None:
+        self._problem, self._transport, self._effort = problem, transport, effort
         self._direct, self._indirect = transport.operators["direct"], transport.operators.get("indirect")
-        self._seeds = [(seed << 3) + k for k in (2, 3, 4, 5)]  # none is the matrix's own
-        scene, reflection = problem.scene, problem.reflection
-        shared = scene.normalised, problem.emission, problem.points, problem.basis
-        self._rays = DirectSolver(*shared, STRATA, self._seeds[0])
-        if isinstance(reflection, InOutFactors):
-            self._term_rays = TermRays(self._rays, reflection)
-            self._paths: PathSolver = TermPaths(problem, SPP // 2, self._seeds[2])
+        self._seeds = element_seeds(stream, 4)
+        self._rays = DirectSolver(problem, effort.strata, self._seeds[0])
+        if isinstance(problem.reflection, InOutFactors):
+            self._term_rays = TermRays(self._rays, problem.reflection)
+            self._paths: PathSolver = TermPaths(problem, effort.spp // 2, self._seeds[2])
         else:
-            self._paths = PathSolver(*shared, problem.max_depth, SPP, problem.channels, self._seeds[2])
+            self._paths = PathSolver(problem, effort.spp, self._seeds[2])
 
-    def samples(self, rng: np.random.Generator, effort: float) -> Samples:
+    def samples(self, rng: np.random.Generator, part: float) -> Samples:
         """Elements of each mesh, for direct and for indirect light."""
         samples, normals = {}, self._problem.points.normals
         for mesh in self._transport.meshes:
-            lit = for_direct_light(self._transport, normals, mesh.vertices, rng, effort)
+            lit = for_direct_light(self._transport, normals, mesh.vertices, rng, self._effort, part)
             samples[mesh.name, "direct"] = self.direct(lit)
             if self._indirect is not None:
-                seen = for_indirect_light(self._transport, mesh.vertices, rng, effort)
+                seen = for_indirect_light(self._transport, mesh.vertices, rng, self._effort, part)
                 samples[mesh.name, "indirect"] = self.indirect(seen)
         return samples
 

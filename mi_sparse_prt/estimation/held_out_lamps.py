@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.estimation.held_out import Sample, estimate_errors
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
 from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
@@ -16,9 +17,10 @@ POINTS = 256  # of each group
 SPP = 256
 
 
-def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) -> dict[str, Any]:
-    """Estimate the relative L2 error of a matrix of lamps; see ``held_out_error``, whose dict it returns."""
-    rng, m = np.random.default_rng([seed, 1]), problem.emission.size
+def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) -> HeldOutError:
+    """Estimate the relative L2 error of a matrix of lamps; see ``held_out_error``."""
+    stream = random_stream(seed, HELD_OUT)
+    rng, m, seeds = np.random.default_rng(stream), problem.emission.size, element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
     samples = {}
     for group in transport.measurement.groups:
@@ -26,7 +28,7 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
         ids = group.vertices.start + np.sort(rng.choice(size, min(size, POINTS), replace=False))
         asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
         ours = transport.incident.elements(*asked).astype(np.float64)
-        x, y = (_true(problem, asked, (seed << 3) + k) for k in (2, 4))
+        x, y = (_true(problem, asked, *pair) for pair in (seeds[:2], seeds[2:]))
         power = albedo[asked[0]] ** 2
         squares, norms = ((power * a * b).sum(axis=1) for a, b in ((ours - x, ours - y), (x, y)))
         weights = np.full(len(asked[0]), size / len(ids))
@@ -34,9 +36,9 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     return estimate_errors(samples)
 
 
-def _true(problem: Problem, asked: tuple[Any, Any], seed: int) -> NDArray[np.float64]:
-    """Unit-albedo light (m, 3) at listed elements."""
-    found = LampRays(problem, 16, seed).elements(*asked).mean.astype(np.float64)
+def _true(problem: Problem, asked: tuple[Any, Any], rays: int, paths: int) -> NDArray[np.float64]:
+    """Unit-albedo light (m, 3) at listed elements, by the seeds of both."""
+    found = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
     if problem.max_depth != 2:
-        found += LampPaths(problem, SPP, seed + 1).elements(*asked).mean
+        found += LampPaths(problem, SPP, paths).elements(*asked).mean
     return found

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 
+PILOT = 2  # spawn key
 SPP = 64
 STRATA = 4  # shadow rays per axis of a texel
 
@@ -48,14 +48,11 @@ class PilotElements:
 
     Parameters
     ----------
-    scene : Scene
-    lighting : CubemapLighting
-    basis : {"direction", "texel"}
-    max_depth : int
-        As for ``precompute``.
+    problem : Problem
+        At the vertices.
     indirect : bool
         Whether there is indirect light.
-    seed : int
+    seed : int or SeedSequence
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     vertices_per_mesh, texels_per_vertex : int
 
@@ -76,17 +73,20 @@ class PilotElements:
 
     def __init__(
         self,
-        scene: Scene,
-        lighting: CubemapLighting,
-        basis: str,
-        max_depth: int,
+        problem: Problem,
         indirect: bool,
-        seed: int,
+        seed: int | np.random.SeedSequence,
         vertices_per_mesh: int = 256,
         texels_per_vertex: int = 32,
     ) -> None:
-        self._scene, self.lighting, self._basis, self._seed = scene, lighting, basis, seed
-        rng = np.random.default_rng([seed, 1])
+        self.problem, self.lighting, scene, lighting = (
+            problem,
+            problem.emission,
+            problem.scene,
+            problem.emission,
+        )
+        stream = random_stream(seed, PILOT)
+        self._seeds, rng = element_seeds(stream, 4), np.random.default_rng(stream)
         self.sizes = np.array([m.vertices.stop - m.vertices.start for m in scene.meshes])
         chosen = [
             mesh.vertices.start + np.sort(rng.choice(size, min(size, vertices_per_mesh), replace=False))
@@ -99,22 +99,13 @@ class PilotElements:
         self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
         self._albedo = scene.albedo[self.vertices][:, None].astype(np.float64)  # [vertex, 1, rgb]
         self.direct = self._direct()
-        self.indirect = self.paths(max_depth) if indirect else None
+        self.indirect = self.paths(problem.max_depth) if indirect else None
         whole = self.direct.values + (self.indirect.values if self.indirect else 0)
         self._norm = self._total(self._squares(*whole))
 
     def paths(self, max_depth: int, spp: int = SPP) -> Halves:
         """Indirect light at these elements, up to some depth."""
-        seeds = [(self._seed << 2) + k for k in (2, 3)]
-        solver = PathSolver(
-            self._scene.normalised,
-            self.lighting,
-            vertex_points(self._scene),
-            self._basis,
-            max_depth,
-            spp,
-            1 if self._scene.grey else 3,
-        )
+        solver, seeds = PathSolver(replace(self.problem, max_depth=max_depth), spp), self._seeds[2:]
         power = self.lighting.solid_angles[self.texels][..., None].astype(np.float64)
         values, variance = [], np.zeros(())
         for seed in seeds:
@@ -152,11 +143,9 @@ class PilotElements:
 
     def _direct(self) -> Halves:
         """Direct light; in the direction basis a ray tells all."""
-        solver = DirectSolver(
-            self._scene.normalised, self.lighting, vertex_points(self._scene), self._basis, STRATA
-        )
+        solver = DirectSolver(self.problem, STRATA)
         first, second = (
-            solver.elements(*self._flat, (self._seed << 2) + k).reshape(*self.texels.shape, 1) for k in (2, 3)
+            solver.elements(*self._flat, seed).reshape(*self.texels.shape, 1) for seed in self._seeds[:2]
         )
         values = np.stack([first, second]).astype(np.float64)
         return Halves(values, np.zeros_like(values[0]))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.io.checkpoint import Checkpoint
@@ -23,11 +22,11 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 
 
-def exact_direct(solver: DirectSolver, clock: Stopwatch, progress: bool) -> MethodResult:
+def exact_direct(solver: DirectSolver, run: Run) -> MethodResult:
     """All direct light, phase ``direct``: bits, or in the texel basis the mean cosines of the solver's strata."""
-    with clock.phase("direct"):
+    with run.clock.phase("direct"):
         stored = solver.row_storage(len(solver.points))
-        _trace(solver, stored, solver.rows, "direct", progress)
+        _trace(solver, stored, solver.rows, run.bar(len(stored), "direct"))
     if solver.basis == "direction":
         part: Visibility | MeanCosine = Visibility(
             stored.astype(np.uint32, copy=False), solver.points.normals, solver.lighting
@@ -39,13 +38,7 @@ def exact_direct(solver: DirectSolver, clock: Stopwatch, progress: bool) -> Meth
     return MethodResult(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
 
 
-def path_traced(
-    solver: PathSolver,
-    lighting: CubemapLighting,
-    clock: Stopwatch,
-    progress: bool,
-    checkpoint: Path | None = None,
-) -> Upsampled:
+def path_traced(solver: PathSolver, lighting: CubemapLighting, run: Run) -> Upsampled:
     """All indirect light, phase ``indirect``, at the resolution of the solver.
 
     Parameters
@@ -53,16 +46,14 @@ def path_traced(
     solver : PathSolver
     lighting : CubemapLighting
         To which it is interpolated.
-    clock : Stopwatch
-    progress : bool
-    checkpoint : Path, optional
-        Finished rows are kept in this file until all are.
+    run : Run
     """
-    with clock.phase("indirect"):
+    with run.clock.phase("indirect"):
         shape = (len(solver.points), solver.lighting.n_directions, solver.channels)
-        density = np.zeros(shape, dtype=np.float16)
+        density, checkpoint = np.zeros(shape, dtype=np.float16), run.checkpoint()
         kept = Checkpoint(checkpoint, density) if checkpoint else None
-        _trace(solver, density, lambda ids: solver.rows(ids).mean, "indirect", progress, kept)
+        bar = run.bar(len(density), "indirect", done=kept.rows_done if kept else 0)
+        _trace(solver, density, lambda ids: solver.rows(ids).mean, bar, kept)
     return Upsampled(density, upsampling(solver.lighting, lighting), lighting)
 
 
@@ -76,14 +67,12 @@ def _trace(
     solver: DirectSolver | PathSolver,
     stored: NDArray[Any],
     rows: Callable[[NDArray[np.uint32]], NDArray[Any]],
-    name: str,
-    progress: bool,
+    bar: tqdm,
     kept: Checkpoint | None = None,
 ) -> None:
     """Fill an array with all rows of a solver, one wavefront at a time."""
-    first = kept.rows_done if kept else 0
-    with tqdm(total=len(stored), initial=first, desc=name, unit=" rows", disable=not progress) as bar:
-        for a in range(first, len(stored), solver.block_size):
+    with bar:
+        for a in range(kept.rows_done if kept else 0, len(stored), solver.block_size):
             ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
             stored[a : a + len(ids)] = rows(ids)
             if kept:

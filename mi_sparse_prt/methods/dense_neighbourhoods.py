@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.measurement.neighbours import Neighbours, renumber, surface_neighbours
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
 from mi_sparse_prt.scene.scene import Mesh, Scene
@@ -43,11 +42,9 @@ class Neighbourhood:
         return renumber(around.ids[:, 1:], np.arange(inside.start, inside.stop))
 
 
-def neighbourhoods(
-    scene: Scene, sampler: DenseSampler, clock: Stopwatch
-) -> tuple[Dense, list[Neighbourhood]]:
+def neighbourhoods(sampler: DenseSampler) -> tuple[Dense, list[Neighbourhood]]:
     """Dense neighbours of all sparse vertices; vertices with too few on their own surface become dense first."""
-    dense = sampler.dense()
+    scene, clock, dense = sampler.scene, sampler.run.clock, sampler.dense()
     with clock.phase("neighbours"):
         groups = [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
         few = [g.sparse[(g.near_sparse >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]

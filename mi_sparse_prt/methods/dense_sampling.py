@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.bits import Bits
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.sampling.angular import AngularGrid, DenseRows
 from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense
-from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.scene.scene import Mesh
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import Estimate, PathSolver
 
@@ -51,42 +49,39 @@ class DenseSampler:
 
     Parameters
     ----------
-    scene : Scene
     direct : DirectSolver
-        Direction basis.
+        Direction basis, at the scene's vertices.
     grid : AngularGrid
-    clock : Stopwatch
+    run : Run
         Phases ``spatial_sampling``, ``rank``, ``dense_rays`` and ``angular_sampling``.
     """
 
-    def __init__(self, scene: Scene, direct: DirectSolver, grid: AngularGrid, clock: Stopwatch) -> None:
-        self.scene, self.direct, self.grid, self.clock = scene, direct, grid, clock
+    def __init__(self, direct: DirectSolver, grid: AngularGrid, run: Run) -> None:
+        self.scene, self.direct, self.grid, self.run = direct.problem.scene, direct, grid, run
         self._ids: list[NDArray[np.int64]] = []
         self._rows: list[DenseRows] = []
-        self._ranks = np.zeros(len(scene.positions), np.float32)
+        self._ranks = np.zeros(len(direct.points), np.float32)
         self._iterations: dict[str, list[NDArray[np.int64]]] = {}
 
-    def choose(
-        self, mesh: Mesh, fraction: float, radius: float, seed: int, power: float = 1.0, step: float = 0.05
-    ) -> None:
-        """Take a fraction of a mesh's vertices in steps, by local rank within a radius (normalised) to a power."""
+    def choose(self, mesh: Mesh, how: SpatialSampling) -> None:
+        """Take vertices of a mesh in steps, by their local rank."""
         inside, start = mesh.vertices, mesh.vertices.start
-        with self.clock.phase("rank"):
+        with self.run.clock.phase("rank"):
             samples = choose_dense(
                 self.scene.normalised_positions[inside],
                 self.direct.points.keys[inside],
                 lambda ids: self.add(ids + start),
-                SpatialSampling(fraction, step, radius, power=power),
-                seed,
+                how,
+                self.run.seed,
             )
         for phase, sign in (("spatial_sampling", 1), ("rank", -1)):
-            self.clock.add(phase, sign * samples.seconds["choice"])
+            self.run.clock.add(phase, sign * samples.seconds["choice"])
         self._ranks[inside] = samples.ranks
         self._iterations[mesh.name] = [ids + start for ids in samples.iterations]
 
     def add(self, ids: NDArray[np.int64]) -> Bits:
         """Sample the rows of more vertices; returns their visibility."""
-        with self.clock.phase("angular_sampling"):
+        with self.run.clock.phase("angular_sampling"):
             names = ids.astype(np.uint32)
             rows = self.grid.sample(self.scene.normals[ids], lambda r, t: self._traced(names[r], t))
         self._ids.append(ids)
@@ -105,7 +100,7 @@ class DenseSampler:
         return Dense(ids[order], DenseRows(*joined), self._ranks, self._iterations)
 
     def _traced(self, ids: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        with self.clock.phase("dense_rays"):
+        with self.run.clock.phase("dense_rays"):
             return self.direct.visible(ids, texels)
 
 
@@ -113,20 +108,22 @@ def indirect_of(
     solver: PathSolver,
     vertices: NDArray[np.integer],
     texels: NDArray[np.integer],
-    name: str,
-    progress: bool,
-    checkpoint: Path | None = None,
+    run: Run,
+    name: str = "indirect",
+    state: str = "",
 ) -> tuple[Estimate, Checkpoint | None]:
     """Indirect light of all given vertices at all given texels: mean and variance (k, t, channels).
 
-    And the file in which finished rows are kept, for the caller to remove when all is done.
+    And the file in which finished rows are kept, for the caller to remove when all is done. ``name`` is that of the
+    progress bar, ``state`` tells the file from others of the run.
     """
+    checkpoint = run.checkpoint(state)
     # [vertex, mean or variance, texel, channel]
     stored = np.empty((len(vertices), 2, len(texels), solver.channels), np.float32)
     kept = Checkpoint(checkpoint, stored) if checkpoint else None
     done = kept.rows_done if kept else 0
     block = max(1, solver.block_elements // max(1, len(texels)))
-    with tqdm(total=len(vertices), initial=done, desc=name, unit=" rows", disable=not progress) as bar:
+    with run.bar(len(vertices), name, done=done) as bar:
         for a in range(done, len(vertices), block):
             ids = np.asarray(vertices[a : a + block], np.uint32)
             part = solver.elements(

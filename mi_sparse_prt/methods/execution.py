@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from mi_sparse_prt.methods.huang2010 import huang2010_parts
 from mi_sparse_prt.methods.plan import TOGETHER, Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.methods.sparse import sparse_parts
+from mi_sparse_prt.methods.sparse import SparseOptions, sparse_parts
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -41,26 +40,17 @@ class Execution:
 
     Parameters
     ----------
-    problem : Problem
     direct : DirectSolver
-        At its points.
+        Of the problem.
     settings : Settings
     indirect : bool
         Whether there is indirect light.
     run : Run
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        direct: DirectSolver,
-        settings: Settings,
-        indirect: bool,
-        run: Run,
-    ) -> None:
-        self._problem, self._scene, self._solver = problem, problem.scene, direct
-        self._settings, self._any_indirect = settings, indirect
-        self._run, self._clock, self.progress = run, run.clock, run.progress
+    def __init__(self, direct: DirectSolver, settings: Settings, indirect: bool, run: Run) -> None:
+        self._problem, self._solver = direct.problem, direct
+        self._settings, self._any_indirect, self._run = settings, indirect, run
         self._direct: dict[str, MethodResult] = {}
 
     def parts(self, plan: Plan) -> MethodResult:
@@ -85,10 +75,6 @@ class Execution:
         self._direct[how] = self._with_terms(find())
         return self._direct[how]
 
-    def matrix(self, parts: MethodResult) -> LightTransport:
-        """The matrix of evaluated parts, without a report."""
-        return matrix_of(self._problem, parts)
-
     def _with_terms(self, light: MethodResult) -> MethodResult:
         """Direct light with rows for the terms of glossy vertices; they see what their vertices see."""
         reflection = self._problem.reflection
@@ -100,20 +86,20 @@ class Execution:
         return replace(light, direct=factored)
 
     def _exact(self) -> MethodResult:
-        return exact_direct(self._solver, self._clock, self.progress)
+        return exact_direct(self._solver, self._run)
 
     def _consensus(self) -> MethodResult:
-        state = by_consensus(self._scene, self._solver, self._clock)
+        state = by_consensus(self._solver, self._run)
         rays = int(count_bits(state.evaluated).sum())
-        bits = Visibility(state.visible, self._scene.normals, self._solver.lighting)
+        bits = Visibility(state.visible, self._problem.points.normals, self._solver.lighting)
         return MethodResult(bits, None, rays, {"direct": rays, "indirect": 0}, {"direct": rays})
 
     def _edges(self) -> MethodResult:
         """All texels' centres, and where visibility changes between these."""
-        solver = DirectSolver(self._scene.normalised, self._solver.lighting, self._solver.points)
-        centres = exact_direct(solver, self._clock, self.progress)
+        solver = DirectSolver(replace(self._problem, basis="direction"))
+        centres = exact_direct(solver, self._run)
         assert isinstance(centres.direct, Visibility)
-        with self._clock.phase("edges"):
+        with self._run.clock.phase("edges"):
             part, rays = fractional_visibility(solver, centres.direct.bits)
         return replace(centres, direct=part, rays={"direct": centres.rays["direct"] + rays})
 
@@ -121,47 +107,27 @@ class Execution:
         """With interreflections by finite elements."""
         if isinstance(light.direct, FactoredVisibility):
             return self._gathered_terms(plan, light, light.direct)
-        if self._problem.measurement.kind != "vertices":
-            return self._gathered_elsewhere(plan, light)
-        solver, settings = self._solver, self._settings
-        with self._clock.phase("gather_rays"):
-            nodes = choose_nodes(self._scene, solver.points)
-            gather = RadiositySolver(
-                self._scene,
-                solver.lighting,
-                solver.points,
-                plan.rays,
-                settings.max_depth,
-                settings.seed,
-                nodes,
-            )
-        with self._clock.phase("interreflection"):
-            part = gather.indirect(light.direct, plan.tolerance)
+        problem, clock = self._problem, self._run.clock
+        sources, known = problem.at_vertices, light
+        if sources is not problem:  # vertices know the light that surfaces send out
+            known = exact_direct(DirectSolver(replace(sources, basis="direction")), self._run)
+        with clock.phase("gather_rays"):
+            nodes = choose_nodes(problem.scene, sources.points)
+            gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
+        with clock.phase("interreflection"):
+            if sources is problem:
+                part = gather.indirect(light.direct, plan.tolerance)
+            else:
+                part = gather.seen_from(problem.points, known.direct, plan.tolerance)
         rays = light.rays | {"gather": gather.rays}
-        return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
-
-    def _gathered_elsewhere(self, plan: Plan, light: MethodResult) -> MethodResult:
-        """With interreflections at points that are no vertices: these know the light that surfaces send out."""
-        problem, settings = self._problem, self._settings
-        vertices = problem.at_vertices.points
-        solver = DirectSolver(self._scene.normalised, self._solver.lighting, vertices)
-        sources = exact_direct(solver, self._clock, self.progress)
-        with self._clock.phase("gather_rays"):
-            nodes = choose_nodes(self._scene, vertices)
-            before = settings.max_depth if settings.max_depth < 0 else settings.max_depth - 1
-            gather = RadiositySolver(
-                self._scene, solver.lighting, vertices, plan.rays, before, settings.seed, nodes
-            )
-        with self._clock.phase("interreflection"):
-            part = gather.seen_from(problem.points, sources.direct, plan.tolerance)
-        rays = light.rays | {"gather": gather.rays}
-        rays["direct"] += sources.rays["direct"]
+        if known is not light:
+            rays["direct"] += known.rays["direct"]
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
 
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
         """With interreflections among glossy surfaces."""
-        with self._clock.phase("interreflection"):
-            seed = self._settings.seed
+        with self._run.clock.phase("interreflection"):
+            seed = self._run.seed
             part, noise = glossy_indirect(self._problem, direct, plan.rays, plan.tolerance, seed)
         rays = light.rays | {"gather": len(self._problem.points) * plan.rays}
         account = _account(part) | {"noise_of_rays": noise}
@@ -169,8 +135,8 @@ class Execution:
 
     def _path_traced(self, plan: Plan, light: MethodResult) -> MethodResult:
         """With paths for all elements."""
-        paths, lighting = self._paths(plan), self._solver.lighting
-        part = path_traced(paths, lighting, self._clock, self.progress, self._checkpoint(plan))
+        paths = self._paths(plan)
+        part = path_traced(paths, self._solver.lighting, self._run_of(plan))
         if isinstance(paths, TermPaths):
             part = _rows_of_terms(part, paths.colours, self._problem.reflection.glossy)
         elements = len(paths.points) * paths.lighting.n_directions
@@ -185,27 +151,21 @@ class Execution:
     def _together(self, plan: Plan) -> MethodResult:
         """Both parts by a method that evaluates them at the same elements."""
         paths = self._paths(plan) if self._any_indirect else None
-        seed, checkpoint = self._settings.seed, self._checkpoint(plan)
         if plan.direct == "huang2010":
-            return huang2010_parts(
-                self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint
-            )
-        return sparse_parts(
-            self._scene, self._solver, paths, seed, self._clock, self.progress, checkpoint, plan.dense
-        )
+            return huang2010_parts(self._solver, paths, self._run_of(plan))
+        options = SparseOptions()
+        if plan.dense is not None:
+            options = replace(options, spatial=replace(options.spatial, fraction=plan.dense))
+        return sparse_parts(self._solver, paths, self._run_of(plan), options)
 
     def _paths(self, plan: Plan) -> PathSolver:
         return indirect_solver(self._problem, self._settings.of(plan))
 
-    def _checkpoint(self, plan: Plan) -> Path | None:
-        """A file name that stands for all that the rows of the indirect light, and their order, depend on."""
-        if self._run.checkpoint_folder is None:
-            return None
-        state = (
-            f"{self._scene.hash} {self._settings.of(plan)} {plan}".encode()
-            + self._solver.points.keys.tobytes()
-        )
-        return self._run.checkpoint_folder / f"{hashlib.sha256(state).hexdigest()[:32]}.rows"
+    def _run_of(self, plan: Plan) -> Run:
+        """With what the rows of the indirect light, and their order, depend on."""
+        state = f"{self._problem.scene.hash} {self._settings.of(plan)} {plan}".encode()
+        state += self._problem.points.keys.tobytes()
+        return replace(self._run, state=hashlib.sha256(state).hexdigest()[:32])
 
 
 def _account(part: Gathered) -> dict[str, Any]:
@@ -241,17 +201,6 @@ def _rows_of_terms(part: Upsampled, colours: int, glossy: NDArray[np.int64]) -> 
 
 
 def indirect_solver(problem: Problem, settings: Settings) -> PathSolver:
-    """The path tracer that settings ask for, at the scene's vertices."""
-    if isinstance(problem.reflection, InOutFactors):
-        coarser = settings.coarse if settings.coarse.resolution != settings.resolution else None
-        return TermPaths(problem, settings.samples, settings.seed, coarser)
-    return PathSolver(
-        problem.scene.normalised,
-        settings.coarse,
-        problem.points,
-        settings.indirect_basis,
-        settings.max_depth,
-        settings.samples,
-        problem.channels,
-        settings.seed,
-    )
+    """The path tracer that settings ask for, at the problem's points."""
+    kind = TermPaths if isinstance(problem.reflection, InOutFactors) else PathSolver
+    return kind(problem.on(settings.coarse), settings.samples, settings.seed)

@@ -8,18 +8,17 @@ minimization; T(x) = sum of weights times their rows. Sampled values serve the f
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import psutil
 import scipy.sparse
 from numpy.typing import NDArray
-from tqdm.auto import tqdm
 
-from mi_sparse_prt.core.bits import count_bits, pack
+from mi_sparse_prt.core.bits import count_bits
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.io.checkpoint import Checkpoint
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler, indirect_of
 from mi_sparse_prt.methods.result import MethodResult
@@ -30,15 +29,11 @@ from mi_sparse_prt.reconstruction.l1 import l1_fit
 from mi_sparse_prt.reconstruction.normal_equations import normal_equations
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.features import choose_features
+from mi_sparse_prt.sampling.spatial import SpatialSampling
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 
-DENSE_MODEL, DENSE_GROUND = 0.25, 0.205  # Figure 9
-RADIUS = 0.05  # of the scene's longest side: 0.2 on a ground from -2 to 2 (Figure 8)
-LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 10, 40  # section 5.1; the nearest ones where the radius holds fewer
-DIRECTIONS = 350  # Figure 8
-RELATIVE_LAMBDA = 1e-2
 BLOCK = 4096  # sparse vertices at a time
 ROWS = 256  # whole rows of dense vertices at a time
 
@@ -47,68 +42,84 @@ ROWS = 256  # whole rows of dense vertices at a time
 Columns = Callable[[Dense, NDArray[np.float32]], Callable[[NDArray[np.int32]], NDArray[np.int32]]]
 
 
-def best_of_each_vertex(
-    dense: Dense, mean: NDArray[np.float32]
-) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
-    """The paper's columns (section 5.2): 350 features of each sparse vertex's own neighbours."""
-    return lambda near: choose_features(near, mean, dense.rows.features, DIRECTIONS)
+@dataclass(frozen=True)
+class Huang2010Options:
+    """The paper's constants.
+
+    Attributes
+    ----------
+    model, ground : float
+        Share of a mesh's vertices that is dense; a ground is a plane (Figure 9).
+    radius : float
+        Of neighbourhoods, in longest sides of the scene: 0.2 on a ground from -2 to 2 (Figure 8).
+    least_neighbours, most_neighbours : int
+        Section 5.1; the nearest ones where the radius holds fewer.
+    directions : int
+        At which a sparse vertex is sampled (Figure 8).
+    relative_lambda : float
+        Weight of the L1 norm, relative to the one beyond which all weights are 0 (the paper gives none).
+    columns : callable, optional
+        Chooses the directions of sparse vertices by another rule than the paper's (section 5.2), which takes the
+        features of each one's own neighbours.
+    """
+
+    model: float = 0.25
+    ground: float = 0.205
+    radius: float = 0.05
+    least_neighbours: int = 10
+    most_neighbours: int = 40
+    directions: int = 350
+    relative_lambda: float = 1e-2
+    columns: Columns | None = None
+
+    def directions_of(
+        self, dense: Dense, mean: NDArray[np.float32]
+    ) -> Callable[[NDArray[np.int32]], NDArray[np.int32]]:
+        """See ``Columns``."""
+        if self.columns is not None:
+            return self.columns(dense, mean)
+        return lambda near: choose_features(near, mean, dense.rows.features, self.directions)
 
 
 def huang2010_parts(
-    scene: Scene,
-    direct: DirectSolver,
-    indirect: PathSolver | None,
-    seed: int,
-    clock: Stopwatch,
-    progress: bool,
-    checkpoint: Path | None = None,
-    columns: Columns = best_of_each_vertex,
+    direct: DirectSolver, indirect: PathSolver | None, run: Run, options: Huang2010Options | None = None
 ) -> MethodResult:
     """Evaluate and reconstruct T as the paper does; parameters as for ``sparse_parts``.
-
-    ``columns`` chooses the directions of sparse vertices, by whichever rule the paper's is to be compared with.
 
     Raises
     ------
     PrtError
         If the whole rows of the dense vertices, of which L1 minimization makes its equations, do not fit into memory.
     """
-    grid = AngularGrid(direct.lighting)
-    fractions = {mesh.name: DENSE_GROUND if _flat(scene, mesh) else DENSE_MODEL for mesh in scene.meshes}
+    options, scene, grid = options or Huang2010Options(), direct.problem.scene, AngularGrid(direct.lighting)
+    fractions = {m.name: options.ground if _flat(scene, m) else options.model for m in scene.meshes}
     _refuse_what_does_not_fit(scene, fractions, direct, indirect)
-    sampler = DenseSampler(scene, direct, grid, clock)
+    sampler = DenseSampler(direct, grid, run)
     for mesh in scene.meshes:
-        sampler.choose(mesh, fractions[mesh.name], RADIUS, seed)
+        sampler.choose(mesh, SpatialSampling(fractions[mesh.name], radius=options.radius))
     dense = sampler.dense()
     visibility = Visibility(dense.rows.visible, scene.normals[dense.ids], direct.lighting)
     interreflected, kept = None, None
     if indirect is not None:
-        with clock.phase("dense_paths"):
-            interreflected, kept = _interreflected(indirect, dense, grid, progress, checkpoint)
-    weights, evaluated, sparse = _fitted(
-        scene, direct, indirect, dense, visibility, interreflected, columns, clock, progress
-    )
+        with run.clock.phase("dense_paths"):
+            rows, kept = indirect_of(indirect, dense.ids, grid.texels, run)
+            interreflected = Upsampled(rows.mean.astype(np.float16), grid.upsampling, direct.lighting)
+    with run.clock.phase("system"):
+        stacked, mean = whole_rows(visibility, interreflected)
+    weights, evaluated, sparse = _fitted(direct, indirect, dense, stacked, mean, run, options)
     if kept:
         kept.remove()
-    quarter = np.zeros(direct.lighting.n_directions, bool)
-    quarter[grid.texels] = True
     # the paper counts the whole grid, below the horizon too
-    per_dense = count_bits(dense.rows.evaluated | pack(quarter))
+    per_dense = count_bits(dense.rows.evaluated | grid.bits)
     elements = int(per_dense.sum()) + int(evaluated.sum())
+    rays = int(count_bits(dense.rows.evaluated).sum()) + int(evaluated.sum())
+    traced = len(dense.ids) * len(grid.texels) + int(evaluated.sum()) if indirect else 0
     return MethodResult(
         Interpolated(visibility, weights),
         Interpolated(interreflected, weights) if interreflected else None,
         elements,
-        {
-            "direct": elements,
-            "indirect": len(dense.ids) * len(grid.texels) + int(evaluated.sum()) if indirect else 0,
-        },
-        {
-            "direct": int(count_bits(dense.rows.evaluated).sum()) + int(evaluated.sum()),
-            "indirect_paths": (len(dense.ids) * len(grid.texels) + int(evaluated.sum())) * indirect.spp
-            if indirect
-            else 0,
-        },
+        {"direct": elements, "indirect": traced},
+        {"direct": rays, "indirect_paths": traced * indirect.spp if indirect else 0},
         sampling={
             mesh.name: _rates(mesh, dense, per_dense, sparse, evaluated, direct.lighting.n_directions)
             for mesh in scene.meshes
@@ -131,14 +142,6 @@ def _refuse_what_does_not_fit(
         )
 
 
-def _interreflected(
-    solver: PathSolver, dense: Dense, grid: AngularGrid, progress: bool, checkpoint: Path | None
-) -> tuple[Upsampled, Checkpoint | None]:
-    """Indirect light of the dense vertices, and the file of finished rows; their variances are not kept."""
-    rows, kept = indirect_of(solver, dense.ids, grid.texels, "indirect", progress, checkpoint)
-    return Upsampled(rows.mean.astype(np.float16), grid.upsampling, solver.lighting), kept
-
-
 def _flat(scene: Scene, mesh: Mesh) -> bool:
     """Whether a mesh is a plane: the paper's ground."""
     normals = scene.normals[mesh.vertices]
@@ -146,38 +149,32 @@ def _flat(scene: Scene, mesh: Mesh) -> bool:
 
 
 def _fitted(
-    scene: Scene,
     direct: DirectSolver,
     indirect: PathSolver | None,
     dense: Dense,
-    visibility: Visibility,
-    interreflected: Upsampled | None,
-    columns: Columns,
-    clock: Stopwatch,
-    progress: bool,
+    stacked: NDArray[np.float32],
+    mean: NDArray[np.float32],
+    run: Run,
+    options: Huang2010Options,
 ) -> tuple[scipy.sparse.csr_array, NDArray[np.int64], NDArray[np.int64]]:
     """Weights A (n_v, n_dense) of all vertices, and how many elements each sparse vertex (given last) cost."""
-    n = len(scene.positions)
-    is_sparse = np.ones(n, bool)
-    is_sparse[dense.ids] = False
-    sparse = np.flatnonzero(is_sparse)
-    with clock.phase("system"):
-        stacked, mean = whole_rows(visibility, interreflected)
+    n, clock = len(direct.points), run.clock
+    sparse = np.setdiff1d(np.arange(n), dense.ids)
     with clock.phase("features"):
-        directions_of = columns(dense, mean)
+        directions_of = options.directions_of(dense, mean)
     owners, used_rows, values = [dense.ids], [np.arange(len(dense.ids))], [np.ones(len(dense.ids))]
     cost = np.zeros(len(sparse), np.int64)
-    with tqdm(total=len(sparse), desc="sparse", unit=" vertices", disable=not progress) as bar:
+    with run.bar(len(sparse), "sparse", " vertices") as bar:
         for a in range(0, len(sparse), BLOCK):
             ids = sparse[a : a + BLOCK]
             with clock.phase("neighbours"):
-                near = _near(scene, ids, dense)
+                near = _near(direct.problem.scene, ids, dense, options)
             with clock.phase("features"):
                 directions = directions_of(near)
             cost[a : a + len(ids)] = (directions >= 0).sum(axis=1)
             sampled = _sampled(direct, indirect, ids, directions, clock)
             with clock.phase("solver"):
-                fit = _weights(stacked, near, directions, sampled, direct.lighting.n_directions)
+                fit = _weights(stacked, near, directions, sampled, options.relative_lambda)
                 # no features, no equations: the neighbours do not differ there, and their mean stands for them
                 alone = (directions < 0).all(axis=1)
                 fit[alone] = (near[alone] >= 0) / np.maximum((near[alone] >= 0).sum(axis=1, keepdims=True), 1)
@@ -227,15 +224,13 @@ def whole_rows(
     return stacked, mean
 
 
-def _near(scene: Scene, ids: NDArray[np.int64], dense: Dense) -> NDArray[np.int32]:
-    """Dense neighbours (n, MOST_NEIGHBOURS) by radius alone, and the nearest ones where the radius holds too few."""
-    p = scene.normalised_positions
-    near = radius_neighbours(p[ids], p[dense.ids], RADIUS, MOST_NEIGHBOURS).ids
-    few = (near >= 0).sum(axis=1) < LEAST_NEIGHBOURS
+def _near(scene: Scene, ids: NDArray[np.int64], dense: Dense, options: Huang2010Options) -> NDArray[np.int32]:
+    """Dense neighbours (n, most) by radius alone, and the nearest ones where the radius holds too few."""
+    p, least = scene.normalised_positions, options.least_neighbours
+    near = radius_neighbours(p[ids], p[dense.ids], options.radius, options.most_neighbours).ids
+    few = (near >= 0).sum(axis=1) < least
     if few.any():
-        near[few, :LEAST_NEIGHBOURS] = radius_neighbours(
-            p[ids[few]], p[dense.ids], np.inf, LEAST_NEIGHBOURS
-        ).ids
+        near[few, :least] = radius_neighbours(p[ids[few]], p[dense.ids], np.inf, least).ids
     return near
 
 
@@ -265,14 +260,15 @@ def _weights(
     near: NDArray[np.int32],
     directions: NDArray[np.int32],
     sampled: NDArray[np.float32],
-    n_directions: int,
+    relative_lambda: float,
 ) -> NDArray[np.float64]:
     """L1 weights (n, k); the channels of a direction are equations of their own."""
     channels = sampled.shape[2]
+    n_directions = stacked.shape[1] // channels
     rows_of = [np.where(directions >= 0, directions + c * n_directions, -1) for c in range(channels)]
     wide = np.concatenate(rows_of, axis=1).astype(np.int32)
     values = np.concatenate([sampled[..., c] for c in range(channels)], axis=1)
-    return l1_fit(*normal_equations(stacked, near, wide, values), RELATIVE_LAMBDA).weights
+    return l1_fit(*normal_equations(stacked, near, wide, values), relative_lambda).weights
 
 
 def _rates(

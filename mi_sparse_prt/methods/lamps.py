@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.sparse_product import multiply_scaled
@@ -39,12 +38,9 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
     indirect, traced = None, 0
     if problem.max_depth != 2:
         with run.clock.phase("gather_rays"):
-            depth = (
-                problem.max_depth if sources is problem or problem.max_depth < 0 else problem.max_depth - 1
-            )
-            solver = RadiositySolver(problem.scene, None, sources.points, rays, depth, run.seed)
+            solver = RadiositySolver(sources, rays, run.seed)
         with run.clock.phase("interreflection"):
-            indirect = solver.apply_coloured(own) if depth != 2 else np.zeros_like(own)
+            indirect = solver.apply_coloured(own) if sources.max_depth != 2 else np.zeros_like(own)
             traced = solver.rays
             if sources is not problem:
                 indirect = _seen_from(problem, own + indirect, rays, run.seed)
@@ -91,7 +87,7 @@ def _seen_from(problem: Problem, light: Floats, rays: int, seed: int) -> Floats:
 
 def _blocks(count: int, size: int, name: str, run: Run) -> Any:
     """Numbers of points, some at a time, with a progress bar."""
-    with tqdm(total=count, desc=name, unit=" rows", disable=not run.progress) as bar:
+    with run.bar(count, name) as bar:
         for a in range(0, count, size):
             ids = np.arange(a, min(a + size, count))
             yield ids

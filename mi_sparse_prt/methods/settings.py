@@ -137,8 +137,3 @@ class Settings:
         return CubemapLighting(
             self.resolution if self.indirect_resolution is None else self.indirect_resolution
         )
-
-    @property
-    def indirect_basis(self) -> str:
-        """A coarse element stands for all directions in its texel, whatever the basis."""
-        return self.basis if self.coarse.resolution == self.resolution else "texel"

@@ -7,18 +7,17 @@ them along the surface; where a few samples at sparse vertices show that to be w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
-from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.bits import Bits, list_bits, pack
-from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.core.ragged import concatenate_ranges, row_starts
 from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.neighbours import Neighbours
 from mi_sparse_prt.methods.dense_neighbourhoods import Neighbourhood
@@ -33,28 +32,41 @@ from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
 
-NEIGHBOURS = 10
-PILOT = 512  # sparse vertices of a mesh that tell whether samples help
-LEAST_NOISE = 0.1  # of a sample, in means of all: a few paths may agree by chance
 BLOCK = 4096  # sparse vertices at a time
 
 
+@dataclass(frozen=True)
+class IndirectOptions:
+    """What the reconstruction of indirect light may be tuned by.
+
+    Attributes
+    ----------
+    neighbours : int
+        Dense vertices from which a vertex takes its light.
+    pilot : int
+        Sparse vertices of a mesh that tell whether samples help.
+    least_noise : float
+        Of a sample, in means of all: a few paths may agree by chance.
+    """
+
+    neighbours: int = 10
+    pilot: int = 512
+    least_noise: float = 0.1
+
+
 def indirect_part(
-    scene: Scene,
     solver: PathSolver,
     dense: Dense,
     groups: list[Neighbourhood],
     evaluated: Bits,
     grid: AngularGrid,
-    clock: Stopwatch,
-    progress: bool,
-    checkpoint: Path | None = None,
+    run: Run,
+    options: IndirectOptions,
 ) -> tuple[Interpolated, int]:
     """Evaluate and reconstruct indirect light.
 
     Parameters
     ----------
-    scene : Scene
     solver : PathSolver
         At the scene's vertices and the full resolution of the lighting.
     dense : Dense
@@ -63,24 +75,23 @@ def indirect_part(
     evaluated : (n_v, words) uint32 bits
         Elements that were evaluated for direct light. Sparse vertices sample indirect light in some of them.
     grid : AngularGrid
-    clock : Stopwatch
+    run : Run
         Phases ``dense_paths``, ``low_rank``, ``sparse_paths``, ``system``, ``solver``.
-    progress : bool
-    checkpoint : Path, optional
-        Finished dense rows are kept in files that begin with this name, until all is done.
+    options : IndirectOptions
 
     Returns
     -------
     Interpolated, int
         The part, and how many of its elements were evaluated.
     """
-    with clock.phase("solver"):
-        priors = [_prior(scene, group, dense) for group in groups]
-    density, noise, kept = _dense_rows(solver, dense, groups, priors, grid, clock, progress, checkpoint)
-    fit = _Fit(solver, density, noise, evaluated, grid, clock)
+    scene = solver.problem.scene
+    with run.clock.phase("solver"):
+        priors = [_prior(scene, group, dense, options.neighbours) for group in groups]
+    density, noise, kept = _dense_rows(solver, dense, groups, priors, grid, run)
+    fit = _Fit(solver, density, noise, evaluated, grid, run, options)
     counts, columns, values = [], [], []
     for group, (near, prior) in zip(groups, priors, strict=True):  # meshes follow each other, and so do rows
-        corrected = fit.corrected(group, near, prior, progress)
+        corrected = fit.corrected(group, near, prior)
         present = near.ids >= 0
         counts.append(present.sum(axis=1))
         columns.append(near.ids[present])
@@ -101,9 +112,7 @@ def _dense_rows(
     groups: list[Neighbourhood],
     priors: list[tuple[Neighbours, NDArray[np.float32]]],
     grid: AngularGrid,
-    clock: Stopwatch,
-    progress: bool,
-    checkpoint: Path | None,
+    run: Run,
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], list[Checkpoint]]:
     """Indirect light (n_dense, n_grid, channels) of the dense vertices on the quarter grid, freed of noise by mesh.
 
@@ -114,13 +123,11 @@ def _dense_rows(
     for number, (group, prior) in enumerate(zip(groups, priors, strict=True)):
         chosen = dense.of_mesh(group.mesh)
         # other vertices would be dense for another fraction
-        path = checkpoint and checkpoint.with_suffix(f".{number}.{len(dense.ids)}{checkpoint.suffix}")
-        with clock.phase("dense_paths"):
-            rows, kept = indirect_of(
-                solver, dense.ids[chosen], grid.texels, f"indirect {group.mesh.name}", progress, path
-            )
+        name, state = f"indirect {group.mesh.name}", f".{number}.{len(dense.ids)}"
+        with run.clock.phase("dense_paths"):
+            rows, kept = indirect_of(solver, dense.ids[chosen], grid.texels, run, name, state)
         files += [kept] if kept else []
-        with clock.phase("low_rank"):
+        with run.clock.phase("low_rank"):
             noise[chosen] = rows.variance.mean(axis=(1, 2))
             smoothing = _smoothing(dense.ids[chosen] - group.mesh.vertices.start, chosen.start, *prior)
             for c in range(solver.channels):
@@ -165,10 +172,12 @@ def _with_sums_of(
     )
 
 
-def _prior(scene: Scene, group: Neighbourhood, dense: Dense) -> tuple[Neighbours, NDArray[np.float32]]:
+def _prior(
+    scene: Scene, group: Neighbourhood, dense: Dense, count: int
+) -> tuple[Neighbours, NDArray[np.float32]]:
     """Neighbours and weights (n, k) of all vertices of a mesh, the dense ones among them."""
     p, n, inside = scene.normalised_positions, scene.normals, group.mesh.vertices
-    near = Neighbours(group.near.ids[:, :NEIGHBOURS], group.near.distances[:, :NEIGHBOURS])
+    near = Neighbours(group.near.ids[:, :count], group.near.distances[:, :count])
     return near, linear_weights(near, p[inside], n[inside], p[dense.ids], n[dense.ids])
 
 
@@ -198,29 +207,30 @@ class _Fit:
         noise: NDArray[np.float64],
         evaluated: Bits,
         grid: AngularGrid,
-        clock: Stopwatch,
+        run: Run,
+        options: IndirectOptions,
     ) -> None:
-        self._solver, self._noise, self._evaluated, self._clock = solver, noise, evaluated, clock
-        self._rows = np.ascontiguousarray(
-            np.moveaxis(density, 2, 0)
-        )  # [channel, dense vertex, place on the grid]
+        self._solver, self._noise, self._evaluated = solver, noise, evaluated
+        self._run, self._clock, self._options = run, run.clock, options
+        # [channel, dense vertex, place on the grid]
+        self._rows = np.ascontiguousarray(np.moveaxis(density, 2, 0))
         self._place = np.full(solver.lighting.n_directions, -1, np.int32)
         self._place[grid.texels] = np.arange(len(grid.texels), dtype=np.int32)
         self.elements = 0
 
     def corrected(
-        self, group: Neighbourhood, near: Neighbours, prior: NDArray[np.float32], progress: bool
+        self, group: Neighbourhood, near: Neighbours, prior: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Weights (n, k) of all vertices of a mesh."""
         weights, start = prior.copy(), group.mesh.vertices.start
         order = np.argsort(mix(self._solver.points.keys[group.sparse]), kind="stable")
-        pilot = np.sort(group.sparse[order[:PILOT]])
+        pilot = np.sort(group.sparse[order[: self._options.pilot]])
         halves, noise = self._sampled(pilot, near.ids[pilot - start], prior[pilot - start], 2)
         with self._clock.phase("solver"):
             deviation = choose_deviation((halves[0], halves[1]), noise)
         if deviation == 0:
             return weights
-        for ids in self._batches(group, pilot, progress):
+        for ids in self._batches(group, pilot):
             if ids is not pilot:
                 halves, noise = self._sampled(ids, near.ids[ids - start], prior[ids - start], 1)
             with self._clock.phase("solver"):
@@ -228,15 +238,14 @@ class _Fit:
                 weights[ids - start] += fit_correction(system, noise, deviation).astype(np.float32)
         return weights
 
-    @staticmethod
-    def _batches(
-        group: Neighbourhood, pilot: NDArray[np.int64], progress: bool
-    ) -> Iterator[NDArray[np.int64]]:
+    def _batches(self, group: Neighbourhood, pilot: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
         """The pilot, and all other sparse vertices of a mesh in their order."""
         others = np.setdiff1d(group.sparse, pilot)
         yield pilot
-        for a in tqdm(range(0, len(others), BLOCK), f"sparse {group.mesh.name}", disable=not progress):
-            yield others[a : a + BLOCK]
+        with self._run.bar(len(others), f"sparse {group.mesh.name}", " vertices") as bar:
+            for a in range(0, len(others), BLOCK):
+                yield others[a : a + BLOCK]
+                bar.update(len(others[a : a + BLOCK]))
 
     def _sampled(
         self, ids: NDArray[np.int64], near: NDArray[np.int32], prior: NDArray[np.float32], parts: int
@@ -256,7 +265,7 @@ class _Fit:
             values[:, rows, at] = found.mean.T
             present = near >= 0
             noise = (self._noise[near] * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
-            noise = np.maximum(noise, LEAST_NOISE * self._noise.mean())
+            noise = np.maximum(noise, self._options.least_noise * self._noise.mean())
             return [
                 self._system(directions[:, k::parts], values[:, :, k::parts], near, prior)
                 for k in range(parts)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.bits import Bits, count_bits, list_bits, unpack
+from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.planner.row_timing import seconds_per_row
@@ -23,6 +24,7 @@ from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
 INNER = 4  # one in so many vertices of a patch is judged: the middle ones, which have all their neighbours
+PATCHES_DRAWN = 3  # spawn key
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 
@@ -44,11 +46,11 @@ def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     return DirectCost(seconds, math.sqrt(max(square, 0.0)))
 
 
-def edges_cost(scene: Scene, direct: DirectSolver, held: PilotElements) -> DirectCost:
+def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     """Texels' centres, and rays along edges of visibility, in the texel basis."""
-    solver = DirectSolver(scene.normalised, direct.lighting, direct.points)
-    centres = len(direct.points) * seconds_per_row(solver)
-    some = DirectSolver(scene.normalised, direct.lighting, points_at(direct.points, held.vertices))
+    problem = replace(direct.problem, basis="direction")
+    centres = len(direct.points) * seconds_per_row(DirectSolver(problem))
+    some = DirectSolver(problem.at(points_at(direct.points, held.vertices)))
     places = np.arange(len(held.vertices))
     bits = some.rows(places).astype(np.uint32, copy=False)
     part, _ = fractional_visibility(some, bits)
@@ -65,9 +67,12 @@ def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
     return Points(*(x[ids] for x in (points.positions, points.normals, points.offset_normals, points.keys)))
 
 
-def consensus_cost(scene: Scene, direct: DirectSolver, held: PilotElements, seed: int) -> DirectCost:
+def consensus_cost(
+    direct: DirectSolver, held: PilotElements, seed: int | np.random.SeedSequence
+) -> DirectCost:
     """Consensus in the direction basis, from patches inside of which all rays are traced as well."""
-    patches, inner, stands_for = _patches(scene, seed)
+    scene = direct.problem.scene
+    patches, inner, stands_for = _patches(scene, np.random.default_rng(random_stream(seed, PATCHES_DRAWN)))
     ids = np.concatenate(patches)
     state = Consensus(
         direct.points.normals[ids],
@@ -89,14 +94,14 @@ def consensus_cost(scene: Scene, direct: DirectSolver, held: PilotElements, seed
 
 
 def _patches(
-    scene: Scene, seed: int
+    scene: Scene, rng: np.random.Generator
 ) -> tuple[list[NDArray[np.int64]], NDArray[np.int64], NDArray[np.float64]]:
     """Neighbouring vertices around random ones of each mesh.
 
     Returns also the places of those inside, that have all their neighbours, in the patches one after the other, and
     how many vertices of the scene each of them stands for.
     """
-    rng, patches, inner, stands_for, first = np.random.default_rng([seed, 3]), [], [], [], 0
+    patches, inner, stands_for, first = [], [], [], 0
     for mesh in scene.meshes:
         p = scene.normalised_positions[mesh.vertices]
         centres = p[rng.choice(len(p), max(1, round(PATCHES * len(p) / scene.n_vertices)), replace=False)]

@@ -12,7 +12,6 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.problem import Problem
 
 
 class _Share(NamedTuple):
@@ -40,19 +39,20 @@ _INDIRECT = {
 }
 
 
+class Forecast(NamedTuple):
+    """Seconds and bytes of a matrix."""
+
+    seconds: float
+    bytes: float
+
+
 def forecast(
-    problem: Problem,
-    direct: DirectSolver,
-    settings: Settings,
-    plan: Plan,
-    indirect: bool,
-    seconds: float | None = None,
-) -> dict[str, float]:
-    """Predict seconds and bytes of a matrix, and refuse what cannot fit into memory.
+    direct: DirectSolver, settings: Settings, plan: Plan, indirect: bool, seconds: float | None = None
+) -> Forecast:
+    """Predict what a matrix takes, and refuse what cannot fit into memory.
 
     Parameters
     ----------
-    problem : Problem
     direct : DirectSolver
         At all vertices.
     settings : Settings
@@ -70,7 +70,7 @@ def forecast(
         If there is not enough memory.
     """
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
-    paths = indirect_solver(problem, settings.of(plan))
+    paths = indirect_solver(direct.problem, settings.of(plan))
     elements = paths.lighting.n_directions * paths.channels
     per_vertex = light.bytes * direct.row_storage(1).nbytes + more.bytes * 2 * elements
     needed, available = len(direct.points) * per_vertex, psutil.virtual_memory().available
@@ -83,4 +83,4 @@ def forecast(
         row = (light.rays + more.rays) * seconds_per_row(direct)
         row += more.paths * seconds_per_row(paths) if more.paths else 0.0
         seconds = len(direct.points) * row
-    return {"seconds": seconds, "bytes": float(needed)}
+    return Forecast(seconds, float(needed))

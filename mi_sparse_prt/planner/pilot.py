@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from mi_sparse_prt.estimation import element_sampling, held_out
+from mi_sparse_prt.estimation.element_sampling import Effort
+from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN, TARGET, Costs, choose, predictions
@@ -19,22 +20,19 @@ from mi_sparse_prt.planner.path_costs import (
 from mi_sparse_prt.planner.radiosity_costs import gather_costs
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.problem import Problem
 
 VERTICES = 192  # of a pilot, in all meshes together
 LEAST_VERTICES = 16  # of each
 TEXELS = 16
-SEEDS = 1 << 20  # apart from those of the matrix
 LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samples per element
 DRAWN = 0.6e-6  # seconds per element of a check that is drawn for direct light
 
 
-def measure(problem: Problem, direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
+def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     """Measure the costs of all plans that settings leave open.
 
     Parameters
     ----------
-    problem : Problem
     direct : DirectSolver
         At all vertices.
     settings : Settings
@@ -47,27 +45,27 @@ def measure(problem: Problem, direct: DirectSolver, settings: Settings, indirect
     Costs
         ``fixed`` is that of held-out elements.
     """
-    scene = problem.scene
+    problem, scene = direct.problem, direct.problem.scene
     count = max(LEAST_VERTICES, VERTICES // len(scene.meshes))
-    seed, lighting = settings.seed + SEEDS, direct.lighting
-    held = PilotElements(scene, lighting, settings.basis, settings.max_depth, indirect, seed, count, TEXELS)
+    seed, lighting = settings.seed, direct.lighting
+    held = PilotElements(problem, indirect, seed, count, TEXELS)
     auto, exact = settings.method == "auto", exact_cost(direct, held)
     light = {"exact": exact}
     if auto and settings.basis == "direction":
-        light["consensus"] = consensus_cost(scene, direct, held, seed)
+        light["consensus"] = consensus_cost(direct, held, seed)
     elif auto:
-        light["edges"] = edges_cost(scene, direct, held)
+        light["edges"] = edges_cost(direct, held)
     check = _check(held)
     costs = Costs(check, light, direct_share=held.share(held.direct))
     if settings.target_error is not None:
-        costs = replace(costs, fixed=(1 + held_out.ROUND) * check, check=check)
+        costs = replace(costs, fixed=(1 + ROUND) * check, check=check)
     if not indirect:
         return costs
     path = seconds_of_a_path(problem, settings, lighting)
     fine, asked = lighting.resolution, settings.indirect_resolution
     costs = replace(costs, paths=path_costs(problem, settings, held, path, [asked or fine]))
     if auto:
-        costs = replace(costs, gather=gather_costs(scene, direct, held, seed))
+        costs = replace(costs, gather=gather_costs(direct, held, seed))
     if auto and settings.basis == "direction" and asked in (None, fine):
         sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
         costs = replace(costs, sparse=sparse)
@@ -88,8 +86,9 @@ def _too_dear(costs: Costs, settings: Settings, path: float, noise: float) -> bo
 def _check(held: PilotElements) -> float:
     """Seconds of a check by held-out elements."""
     totals = [int(size) * held.lighting.n_directions for size in held.sizes]
-    drawn = DRAWN * sum(element_sampling.rays_of(total) for total in totals)
+    effort = Effort()
+    drawn = DRAWN * sum(effort.rays_of(total) for total in totals)
     if held.indirect is None:
         return drawn
-    paths = sum(element_sampling.paths_of(total, len(totals)) for total in totals)
-    return drawn + paths * held_out.SPP * held.indirect.seconds
+    paths = sum(effort.paths_of(total, len(totals)) for total in totals)
+    return drawn + paths * effort.spp * held.indirect.seconds

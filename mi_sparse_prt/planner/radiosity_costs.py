@@ -13,15 +13,16 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.reconstruction.node_placement import NODES
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import FEW_ROWS, MIXED, MOST, ROWS
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.touching_surfaces import contacts
 
+GATHERED = 4  # spawn key
 FEW, MANY = 64, 256  # rays per vertex of a pilot
 PATHS = 256  # per element that tell a bias: fewer would see one of 0.5% where there is none
 TIMED = 2048  # rays per vertex, where these are timed
@@ -144,25 +145,26 @@ class GatherCosts:
         return made + self.multiplication * dense + self.addition * sparse
 
 
-def gather_costs(scene: Scene, direct: DirectSolver, held: PilotElements, seed: int) -> GatherCosts | None:
+def gather_costs(
+    direct: DirectSolver, held: PilotElements, seed: int | np.random.SeedSequence
+) -> GatherCosts | None:
     """Measure at the vertices of the held-out elements; None where light cannot be gathered.
 
     Parameters
     ----------
-    scene : Scene
     direct : DirectSolver
         At all vertices.
     held : PilotElements
         With indirect light.
-    seed : int
+    seed : int or SeedSequence
     """
     assert held.indirect is not None
+    scene, stream = direct.problem.scene, random_stream(seed, GATHERED)
     if not scene.diffuse:
         return None
-    pilot = _Pilot(scene, direct, held.vertices)
+    pilot, seeds = _Pilot(direct, held.vertices), element_seeds(stream, 2)
     try:
-        few = [pilot.rays(FEW, seed + k) for k in range(2)]
-        many = [pilot.rays(MANY, seed + k) for k in range(2)]
+        few, many = ([pilot.rays(count, k) for k in seeds] for count in (FEW, MANY))
     except PrtError:  # too many backs of surfaces are in sight
         return None
     light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]
@@ -172,7 +174,7 @@ def gather_costs(scene: Scene, direct: DirectSolver, held: PilotElements, seed: 
     bias = _typical(held, (light[1][0] - first.values[0]) * (light[1][1] - first.values[1]))
     multiplication, addition = _seconds_of_products(direct, many[0])
     # what does not grow with their number, an array of all vertices for one, is in both
-    times = [_least_seconds(partial(pilot.rays, count, seed)) for count in (FEW, TIMED)]
+    times = [_least_seconds(partial(pilot.rays, count, seeds[0])) for count in (FEW, TIMED)]
     ray = max(times[1] - times[0], 0.0) / ((TIMED - FEW) * len(held.vertices))
     return GatherCosts(
         scene.n_vertices,
@@ -186,7 +188,7 @@ def gather_costs(scene: Scene, direct: DirectSolver, held: PilotElements, seed: 
         math.sqrt(max(bias, 0.0)),
         sizes[0],
         max(sizes[1] / max(sizes[0], 1e-150), 1.0),
-        pilot.spectra(seed),
+        pilot.spectra(stream),
     )
 
 
@@ -227,7 +229,8 @@ def _seconds(work: Callable[[], object]) -> float:
 class _Pilot:
     """Gathers light at some vertices of a scene."""
 
-    def __init__(self, scene: Scene, direct: DirectSolver, vertices: NDArray[np.integer]) -> None:
+    def __init__(self, direct: DirectSolver, vertices: NDArray[np.integer]) -> None:
+        scene = direct.problem.scene
         self._scene, self._direct, self._vertices = scene, direct, vertices
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3]
         self._contacts = contacts(scene, direct.lighting)
@@ -249,13 +252,15 @@ class _Pilot:
         reflected = seen[:, :, None] * self._albedo[rays.indices][:, None]  # [entry, texel, channel]
         return (mean @ reflected.reshape(len(row), -1)).reshape(*texels.shape, -1).astype(np.float64)
 
-    def spectra(self, seed: int) -> NDArray[np.float64]:
+    def spectra(self, stream: np.random.SeedSequence) -> NDArray[np.float64]:
         """Energy of the first bounce beyond each rank, relative, in half a sample and in all of it (2, k)."""
-        n, rng = self._direct.lighting.n_directions, np.random.default_rng([seed, 2])
+        n, rng = self._direct.lighting.n_directions, np.random.default_rng(stream)
         texels = rng.choice(n, min(n, SAMPLE), replace=False)
         vertices = rng.choice(len(self._albedo), min(len(self._albedo), SAMPLE), replace=False)
-        sample = _Pilot(self._scene, self._direct, vertices)
-        light = sample.light(sample.rays(FEW, seed), np.tile(texels, (len(vertices), 1)))[:, :, 0]
+        sample = _Pilot(self._direct, vertices)
+        light = sample.light(
+            sample.rays(FEW, element_seeds(stream, 1)[0]), np.tile(texels, (len(vertices), 1))
+        )[:, :, 0]
         halves = [np.array_split(rng.permutation(k), 2)[0] for k in light.shape * HALVES]
         some = [_beyond(light[np.ix_(*pair)]) for pair in zip(halves[::2], halves[1::2], strict=True)]
         whole = _beyond(light)

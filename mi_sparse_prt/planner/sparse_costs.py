@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mi_sparse_prt.methods.sparse import DENSE
+from mi_sparse_prt.methods.sparse import SparseOptions
 
-# measured with that share of dense vertices
+DENSE = SparseOptions().spatial.fraction  # of the vertices: with that share these were measured
 RAYS = 0.8  # seconds of direct light, relative to all rays ...
 PATHS = 0.08  # ... and of indirect light, relative to all paths
 OVERHEAD = 60e-6  # seconds per vertex

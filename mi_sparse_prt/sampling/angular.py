@@ -54,6 +54,8 @@ class AngularGrid:
     ----------
     texels : (n_grid,) int
         Every second texel per axis, n_directions / 4 of them (all at resolution 1).
+    bits : bits
+        The same, one bit per direction.
     """
 
     def __init__(self, lighting: CubemapLighting, radius: int = 3) -> None:
@@ -61,7 +63,7 @@ class AngularGrid:
         n = lighting.resolution
         self._face, self._row, self._column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
         self._sampled = (self._row % 2 == 0) & (self._column % 2 == 0)
-        self.texels = np.flatnonzero(self._sampled)
+        self.texels, self.bits = np.flatnonzero(self._sampled), pack(self._sampled)
 
     def sample(
         self,

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
-from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, texel_at
+from mi_sparse_prt.emission.cubemap import face_coordinates, texel_at
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.solvers.paths import Estimate, has_mirrors
+from mi_sparse_prt.solvers.problem import Problem
 
 # Per sample of a row; a power of four. With 64 an element costs a quarter less, but the sum of a row, which is what
 # broad lights see, is then known no better than by path tracing in the same time; with 256 three times better.
@@ -39,18 +39,9 @@ class AdjointSolver:
 
     Parameters
     ----------
-    scene : mi.Scene
-        Normalised copy without emitters.
-    lighting : CubemapLighting
-    points : Points
-    basis : {"direction", "texel"}
-        Light from the texel's centre alone, or radiance 1 over the whole texel.
-    max_depth : int
-        As Mitsuba's ``path`` counts it for a ray that ends on the point: 3 = one interreflection, -1 = no limit.
+    problem : Problem
     spp : int
         Paths that every element is estimated from; an odd number counts as the next even one.
-    channels : {1, 3}
-        1 in a grey scene: red stands for all.
     seed : int
 
     Notes
@@ -60,22 +51,13 @@ class AdjointSolver:
     of a row's sum.
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        lighting: CubemapLighting,
-        points: Points,
-        basis: str = "direction",
-        max_depth: int = 5,
-        spp: int = 16,
-        channels: int = 3,
-        seed: int = 0,
-    ) -> None:
-        self.scene, self.lighting, self.points = scene, lighting, points
-        self.basis, self.max_depth, self.channels, self.seed = basis, max_depth, channels, seed
-        self.spp = spp + spp % 2
-        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
-        self._sees_light = basis == "texel" and has_mirrors(scene)
+    def __init__(self, problem: Problem, spp: int = 16, seed: int = 0) -> None:
+        self.problem, self.scene = problem, problem.scene.normalised
+        self.lighting, self.points = problem.emission, problem.points
+        self.basis, self.max_depth, self.channels = problem.basis, problem.max_depth, problem.channels
+        self.spp, self.seed = spp + spp % 2, seed
+        self._points, self._texels = PointArrays(self.points), TexelArrays(self.lighting)
+        self._sees_light = self.basis == "texel" and has_mirrors(self.scene)
 
     @property
     def block_size(self) -> int:

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.random_keys import random_generator
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.mean_cosine import FIXED_POINT
+from mi_sparse_prt.solvers.problem import Problem
 
 Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
 
@@ -32,31 +31,21 @@ class DirectSolver:
 
     Parameters
     ----------
-    scene : mi.Scene
-        Normalised copy without emitters.
-    lighting : CubemapLighting
-    points : Points
-    basis : {"direction", "texel"}
-        Visibility towards the texel's centre, or the cosine-weighted mean over stratified directions in the texel
-        (``solvers.texel_edges`` gets nearly as near to that with few more rays than centres take).
+    problem : Problem
+        Direction basis: visibility towards the texel's centre. Texel basis: the cosine-weighted mean over stratified
+        directions in the texel (``solvers.texel_edges`` gets nearly as near to that with few more rays than centres
+        take).
     strata : int
         Texel basis: strata per axis of a texel; strata**2 rays per element, each at a random place of its stratum.
     seed : int
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        lighting: CubemapLighting,
-        points: Points,
-        basis: str = "direction",
-        strata: int = 2,
-        seed: int = 0,
-    ) -> None:
-        self.scene, self.lighting, self.points = scene, lighting, points
-        self.basis, self.seed = basis, seed
-        self.strata = strata if basis == "texel" else 1
-        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
+    def __init__(self, problem: Problem, strata: int = 2, seed: int = 0) -> None:
+        self.problem, self.scene = problem, problem.scene.normalised
+        self.lighting, self.points = problem.emission, problem.points
+        self.basis, self.seed = problem.basis, seed
+        self.strata = strata if self.basis == "texel" else 1
+        self._points, self._texels = PointArrays(self.points), TexelArrays(self.lighting)
 
     @property
     def rays_per_element(self) -> int:

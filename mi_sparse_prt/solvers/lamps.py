@@ -105,7 +105,8 @@ class LampPaths(PathSolver):
     """
 
     def __init__(self, problem: Problem, spp: int = 64, seed: int = 0) -> None:
-        self.scene, self.points, self.spp, self.seed = problem.scene.normalised, problem.points, spp, seed
+        self.problem, self.scene, self.points = problem, problem.scene.normalised, problem.points
+        self.spp, self.seed = spp, seed
         self.max_depth, self.channels = problem.max_depth, 3
         self._world, self._emission = problem.scene, problem.emission
         self._points = PointArrays(problem.points)

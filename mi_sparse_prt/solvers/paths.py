@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # paths per wavefront, about half a second each
 ROULETTE_DEPTH = 5  # bounces before Russian roulette starts, as Mitsuba's ``path`` has it
@@ -40,35 +39,19 @@ class PathSolver:
 
     Parameters
     ----------
-    scene : mi.Scene
-        Normalised copy without emitters.
-    lighting : CubemapLighting
-    points : Points
-    basis : {"direction", "texel"}
-        Light from the texel's centre alone, or radiance 1 over the whole texel.
-    max_depth : int
-        As Mitsuba's ``path`` counts it for a ray that ends on the point: 3 = one interreflection, -1 = no limit.
+    problem : Problem
+        Light from a texel's centre alone, or radiance 1 over the whole texel, by its basis.
     spp : int
         Paths per element.
-    channels : {1, 3}
-        1 in a grey scene: red stands for all.
     seed : int
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        lighting: CubemapLighting,
-        points: Points,
-        basis: str = "direction",
-        max_depth: int = 5,
-        spp: int = 16,
-        channels: int = 3,
-        seed: int = 0,
-    ) -> None:
-        self.scene, self.lighting, self.points = scene, lighting, points
-        self.basis, self.max_depth, self.spp, self.channels, self.seed = basis, max_depth, spp, channels, seed
-        self._points, self._texels = PointArrays(points), TexelArrays(lighting)
+    def __init__(self, problem: Problem, spp: int = 16, seed: int = 0) -> None:
+        self.problem, self.scene = problem, problem.scene.normalised
+        self.lighting, self.points = problem.emission, problem.points
+        self.basis, self.max_depth, self.channels = problem.basis, problem.max_depth, problem.channels
+        self.spp, self.seed = spp, seed
+        self._points, self._texels = PointArrays(self.points), TexelArrays(self.lighting)
 
     @property
     def block_elements(self) -> int:

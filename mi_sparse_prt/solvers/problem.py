@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
@@ -48,12 +51,25 @@ class Problem:
         """1 in a grey scene, else 3."""
         return 1 if self.scene.grey else 3
 
+    def at(self, points: Points) -> Problem:
+        """The same at other points of the scene (normalised frame), which receive light and reflect all of it."""
+        n = len(points)
+        where = Measurement(points.keys, np.ones(n, np.float32), (), "points", normalised=points)
+        return replace(self, measurement=where, reflection=Diffuse(np.ones((n, 3), np.float32)))
+
+    def on(self, emission: CubemapLighting) -> Problem:
+        """The same on another cubemap; an element of a coarser one stands for all directions in its texel."""
+        if emission.resolution == self.emission.resolution:
+            return self
+        return replace(self, emission=emission, basis="texel")
+
     @property
     def at_vertices(self) -> Problem:
-        """The same at the vertices, which know the light that surfaces send out."""
+        """The same at the vertices, which know the light that surfaces send out: one bounce before other points."""
         if self.measurement.kind == "vertices":
             return self
-        return replace(self, measurement=mesh_vertices(self.scene), reflection=Diffuse(self.scene.albedo))
+        depth = self.max_depth if self.max_depth < 0 else self.max_depth - 1
+        return replace(diffuse_problem(self.scene, self.emission, depth), basis=self.basis)
 
 
 def diffuse_problem(scene: Scene, emission: Any, max_depth: int = 5) -> Problem:

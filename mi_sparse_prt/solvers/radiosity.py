@@ -30,6 +30,7 @@ from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 
@@ -274,16 +275,11 @@ class RadiositySolver(FiniteElements):
 
     Parameters
     ----------
-    scene : Scene
-    lighting : CubemapLighting, optional
-        Without it, nothing is looked at where surfaces touch.
-    points : Points
-        Of all vertices (``vertex_points``).
+    problem : Problem
+        At the vertices. Bounces that add next to nothing are left out. Where surfaces touch, the texels of a cubemap
+        are looked at; lamps are not.
     rays_per_vertex : int
         A power of two: Sobol points, scrambled for each vertex by its key.
-    max_depth : int
-        As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
-        nothing are left out.
     seed : int
     nodes : Nodes, optional
         The vertices that gather light, others interpolate theirs; all if not given.
@@ -309,23 +305,21 @@ class RadiositySolver(FiniteElements):
 
     def __init__(
         self,
-        scene: Scene,
-        lighting: CubemapLighting | None,
-        points: Points,
+        problem: Problem,
         rays_per_vertex: int = 256,
-        max_depth: int = 5,
         seed: int = 0,
         nodes: Nodes | None = None,
     ) -> None:
+        scene, points, emission = problem.scene, problem.points, problem.emission
         _check_diffuse(scene)
         nodes = nodes or Nodes(np.arange(len(points)), None)
         super().__init__(
             gather_matrix(scene, points, rays_per_vertex, seed, nodes.ids),
-            np.ascontiguousarray(scene.albedo.T[: 1 if scene.grey else 3]),
+            np.ascontiguousarray(scene.albedo.T[: problem.channels]),
             points.keys,
             nodes,
-            contacts(scene, lighting) if lighting else None,
-            max_depth,
+            contacts(scene, emission) if isinstance(emission, CubemapLighting) else None,
+            problem.max_depth,
             seed,
         )
         self.rays = len(nodes) * rays_per_vertex

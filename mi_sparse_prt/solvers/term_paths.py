@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import LANES, DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
@@ -33,25 +32,12 @@ class TermPaths(PathSolver):
         With in-out factors.
     spp, seed : int
         As for ``PathSolver``.
-    lighting : CubemapLighting, optional
-        A coarser one than the problem's; an element is then the mean over its texel.
     """
 
-    def __init__(
-        self, problem: Problem, spp: int = 16, seed: int = 0, lighting: CubemapLighting | None = None
-    ) -> None:
+    def __init__(self, problem: Problem, spp: int = 16, seed: int = 0) -> None:
         assert isinstance(problem.reflection, InOutFactors)
-        self.colours, rows = problem.channels, 1 + problem.reflection.terms
-        super().__init__(
-            problem.scene.normalised,
-            lighting or problem.emission,
-            problem.points,
-            problem.basis if lighting is None else "texel",
-            problem.max_depth,
-            spp,
-            rows * self.colours,
-            seed,
-        )
+        super().__init__(problem, spp, seed)
+        self.colours, self.channels = problem.channels, (1 + problem.reflection.terms) * problem.channels
         self._lobes = Lobes(problem.reflection)
 
     def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport, MeshRange
 from mi_sparse_prt.validation.mitsuba_reference import (
     ReferenceMatrix,
@@ -241,9 +242,8 @@ def _moved_to_hits(
     hits = sensor_points(scene, rays)
 
     def direct(points: Points, basis: str) -> NDArray[np.float32]:
-        solver = DirectSolver(
-            scene.normalised, lighting, points, basis, parameters["strata"], parameters["seed"]
-        )
+        problem = replace(diffuse_problem(scene, lighting), basis=basis).at(points)
+        solver = DirectSolver(problem, parameters["strata"], parameters["seed"])
         unit_albedo = solver.elements(*flat).reshape(len(vertices), -1, 1)
         return transport.albedo[vertices][:, None] * unit_albedo
 

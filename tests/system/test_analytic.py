@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
@@ -124,8 +124,8 @@ def test_a_closed_box_is_dark(kind, basis, artefact):
     scene = build(0.5, ball=mesh("ball", vertices, triangles, GREY), **BOXES[kind])
     lighting, points = prt.CubemapLighting(8), vertex_points(scene)
     vertex, texel = np.repeat(np.arange(len(points)), 384), np.tile(np.arange(384), len(points))
-    direct = DirectSolver(scene.normalised, lighting, points, basis).elements(vertex, texel)
-    path = PathSolver(scene.normalised, lighting, points, basis, max_depth=5, spp=4, channels=1)
+    direct = DirectSolver(problem_at(scene, lighting, points, basis=basis)).elements(vertex, texel)
+    path = PathSolver(problem_at(scene, lighting, points, basis=basis), 4)
     indirect = path.elements(vertex, texel).mean[:, 0]
     figure = Figure(figsize=(6, 3))
     axes = figure.subplots()
@@ -151,7 +151,7 @@ def irradiance_at_origin(scene: prt.Scene, seeds: int = 64) -> tuple[float, floa
     vertex = int(np.argmin(np.linalg.norm(scene.positions, axis=1)))
     assert np.linalg.norm(scene.positions[vertex]) < 1e-6
     lighting = prt.CubemapLighting(8)
-    solver = DirectSolver(scene.normalised, lighting, vertex_points(scene), "texel", strata=6)
+    solver = DirectSolver(problem_at(scene, lighting, basis="texel"), 6)
     texels = np.arange(lighting.n_directions)
     runs = [
         solver.elements(np.full(len(texels), vertex), texels, seed=k).sum(dtype=np.float64)
@@ -296,7 +296,7 @@ def test_an_integrating_sphere(artefact):
     chosen = np.sort(chosen + 1)
     points, lighting = vertex_points(scene), prt.CubemapLighting(2)
     texels = np.tile(np.arange(24), 40)
-    direct = DirectSolver(scene.normalised, lighting, points, "texel", strata=16)
+    direct = DirectSolver(problem_at(scene, lighting, points, basis="texel"), 16)
     first = direct.elements(np.repeat(chosen, 24), texels).reshape(40, 24).sum(axis=1)
     f, q = 0.25, albedo * 0.75
     figure = Figure(figsize=(6, 3))
@@ -307,7 +307,7 @@ def test_an_integrating_sphere(artefact):
         (5, f * (1 + q + q**2 + q**3)),
         (-1, f / (1 - q)),
     ):
-        path = PathSolver(scene.normalised, lighting, points, "texel", max_depth, 2048, channels=1)
+        path = PathSolver(problem_at(scene, lighting, points, basis="texel", max_depth=max_depth), 2048)
         estimate = path.rows(chosen)
         indirect = (estimate.mean[..., 0] * lighting.solid_angles).sum(axis=1)
         error = np.sqrt((estimate.variance[..., 0] * lighting.solid_angles**2).sum()) / 40
@@ -350,7 +350,7 @@ def test_reciprocity_with_a_lamp_at_the_vertex(artefact):
     vertex = int(ground[np.argmin(np.linalg.norm(scene.positions[ground] - [-0.4, 0, 0.55], axis=1))])
     x = scene.normalised_positions[vertex].astype(np.float64)
     bright = [j for j in range(24) if lighting.directions[j, 1] > 0.3]
-    path = PathSolver(scene.normalised, lighting, vertex_points(scene), "direction", 4, 1 << 16)
+    path = PathSolver(problem_at(scene, lighting, max_depth=4), 1 << 16)
     estimate = path.elements(np.full(len(bright), vertex), np.array(bright))
     strongest = np.argsort(-estimate.mean.mean(axis=1))[:3]
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import problem_at
 from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
@@ -106,7 +107,7 @@ def test_one_kernel_serves_all_direct_blocks(scene, lighting):
     Expected: one kernel for three blocks of different offset and size.
     Result: as expected.
     """
-    solver = DirectSolver(scene.normalised, lighting, vertex_points(scene))
+    solver = DirectSolver(problem_at(scene, lighting))
     found = launched_kernels(lambda: [solver.rows(np.arange(*block, dtype=np.uint32)) for block in BLOCKS])
     assert found.launches == len(BLOCKS)
     assert found.distinct == 1
@@ -136,9 +137,8 @@ def test_one_kernel_serves_all_path_blocks(scene, lighting, channels):
     Expected: one kernel and one launch per block, for rows and for listed elements, whatever the offset and size.
     Result: as expected.
     """
-    solver = PathSolver(
-        scene.normalised, lighting, vertex_points(scene), "direction", MAX_DEPTH, SPP, channels
-    )
+    solver = PathSolver(problem_at(scene, lighting, max_depth=MAX_DEPTH), SPP)
+    solver.channels = channels
     rng = np.random.default_rng(0)
 
     def work():
@@ -161,7 +161,7 @@ def test_the_bare_loop_traces_the_same_rays(scene, lighting):
     """
     points = vertex_points(scene)
     bare = BareOcclusion(scene.normalised, lighting, points)
-    solver = DirectSolver(scene.normalised, lighting, points)
+    solver = DirectSolver(problem_at(scene, lighting, points))
     above = points.normals @ lighting.directions.T > 1e-6
     for a, b in BLOCKS:
         bits = solver.rows(np.arange(a, b, dtype=np.uint32))

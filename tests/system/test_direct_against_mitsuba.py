@@ -3,11 +3,11 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse, mesh
+from conftest import T, build, diffuse, mesh, problem_at
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.vertices import VertexRays, sensor_points, vertex_points, vertex_rays
+from mi_sparse_prt.measurement.vertices import VertexRays, sensor_points, vertex_rays
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
@@ -71,7 +71,7 @@ def test_all_columns_of_a_small_scene(coloured_scene, artefact):
     unit = mitsuba_columns(coloured_scene, rays, light, towards(lighting.directions), spp=1)
     reference = unit * lighting.solid_angles[:, None]
 
-    hits = DirectSolver(coloured_scene.normalised, lighting, sensor_points(coloured_scene, rays))
+    hits = DirectSolver(problem_at(coloured_scene, lighting, sensor_points(coloured_scene, rays)))
     ours = elements(hits, coloured_scene.albedo)
     print(
         f"hit against Mitsuba: {share_that_differs(ours, reference):.5%} of elements differ by more than 1e-4"
@@ -82,7 +82,7 @@ def test_all_columns_of_a_small_scene(coloured_scene, artefact):
     assert share_that_differs(ours, 1.02 * reference) > 0.95 * lit.mean()
     assert share_that_differs(ours, np.roll(reference, 1, axis=1)) > 0.3 * lit.mean()
 
-    vertices = DirectSolver(coloured_scene.normalised, lighting, vertex_points(coloured_scene))
+    vertices = DirectSolver(problem_at(coloured_scene, lighting))
     at_vertices = elements(vertices, coloured_scene.albedo)
     moved = ((at_vertices > 0) != (ours > 0)).any(axis=2)
     relative = np.linalg.norm(at_vertices - ours) / np.linalg.norm(ours)
@@ -138,11 +138,11 @@ def test_no_vertex_is_missed(kind, artefact):
     light = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
     reference = mitsuba_columns(scene, rays, light, towards(lighting.directions), spp=1)
     reference *= lighting.solid_angles[:, None]
-    ours = elements(DirectSolver(scene.normalised, lighting, sensor_points(scene, rays)), scene.albedo)
+    ours = elements(DirectSolver(problem_at(scene, lighting, sensor_points(scene, rays))), scene.albedo)
     assert np.isfinite(reference).all()
     assert share_that_differs(ours, reference) <= 1e-3
 
-    at_vertices = elements(DirectSolver(scene.normalised, lighting, vertex_points(scene)), scene.albedo)
+    at_vertices = elements(DirectSolver(problem_at(scene, lighting)), scene.albedo)
     assert np.isfinite(at_vertices).all()
     top = scene.positions[:, 1] > scene.positions[:, 1].max() - 1e-3
     up = top & (scene.normals[:, 1] > 0.9)
@@ -178,7 +178,7 @@ def test_texel_basis_against_the_cubemap_emitter(grey_scene, artefact):
     theirs = [
         mitsuba_columns(grey_scene, rays, light, texels, 512, seed=100 * k).sum(axis=(0, 2)) for k in range(4)
     ]
-    solver = DirectSolver(grey_scene.normalised, lighting, sensor_points(grey_scene, rays), "texel", 6)
+    solver = DirectSolver(problem_at(grey_scene, lighting, sensor_points(grey_scene, rays), basis="texel"), 6)
     ours = [elements(solver, grey_scene.albedo, seed=k).sum(axis=(0, 2)) for k in range(16)]
 
     def mean_and_error(runs: list) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import COLOURS, T, build, diffuse, mesh, still_life
+from conftest import COLOURS, T, build, diffuse, mesh, problem_at, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
@@ -30,12 +30,12 @@ def test_still_life(artefact):
     """
     scene, lighting = build(0.1, **still_life(COLOURS)), prt.CubemapLighting(2)
     points = vertex_points(scene)
-    solver = DirectSolver(scene.normalised, lighting, points, "texel", strata=4)
+    solver = DirectSolver(problem_at(scene, lighting, points, basis="texel"), 4)
     direct = MeanCosine(solver.rows(np.arange(len(points))), lighting)
     chosen = np.sort(np.random.default_rng(0).choice(len(points), 100, replace=False))
-    found = RadiositySolver(scene, lighting, points, 1024, max_depth=5).rows(direct, chosen)
+    found = RadiositySolver(problem_at(scene, lighting, points), 1024).rows(direct, chosen)
     halves = [
-        PathSolver(scene.normalised, lighting, points, "texel", max_depth=5, spp=512, seed=seed).rows(chosen)
+        PathSolver(problem_at(scene, lighting, points, basis="texel"), 512, seed=seed).rows(chosen)
         for seed in (0, 1)
     ]
     power = lighting.solid_angles[:, None]
@@ -86,12 +86,12 @@ def test_an_integrating_sphere(artefact):
     scene = build(float("inf"), sphere=bowl(np.radians(np.arange(180, 59, -3)), 120, diffuse(*(albedo,) * 3)))
     lighting, points = prt.CubemapLighting(8), vertex_points(scene)
     wall = scene.positions[:, 1] < np.cos(np.radians(65))
-    solver = DirectSolver(scene.normalised, lighting, points, "texel", strata=2)
+    solver = DirectSolver(problem_at(scene, lighting, points, basis="texel"), 2)
     direct = MeanCosine(solver.rows(np.arange(len(points))), lighting)
     even = direct.relight(np.ones((lighting.n_directions, 3), np.float32))[:, :1]
     print(f"direct {even[wall].mean():.5f}, known {f}")
     q = albedo * (1 - f)
-    gather = RadiositySolver(scene, lighting, points, 256)
+    gather = RadiositySolver(problem_at(scene, lighting, points), 256)
     figure = Figure(figsize=(6, 3))
     axes = figure.subplots()
     for max_depth, known in ((2, f), (3, f * (1 + q)), (5, f * (1 - q**4) / (1 - q)), (-1, f / (1 - q))):
@@ -105,7 +105,7 @@ def test_an_integrating_sphere(artefact):
     axes.legend()
     artefact(figure)
     nodes = choose_nodes(scene, points, 1000, small=1000)
-    some = RadiositySolver(scene, lighting, points, 256, max_depth=-1, nodes=nodes)
+    some = RadiositySolver(problem_at(scene, lighting, points, max_depth=-1), 256, nodes=nodes)
     value = even[:, 0] + some.apply(even)[:, 0, 0]
     print(
         f"{len(some.nodes)} nodes of {len(points)} vertices: {value[wall].mean():.5f}, known {f / (1 - q):.5f}"
@@ -153,10 +153,10 @@ def test_a_room_of_one_radiance(artefact):
     }
     scene, lighting = build(0.25, **walls), prt.CubemapLighting(16)
     points = vertex_points(scene)
-    solver = DirectSolver(scene.normalised, lighting, points, "texel", strata=4)
+    solver = DirectSolver(problem_at(scene, lighting, points, basis="texel"), 4)
     direct = MeanCosine(solver.rows(np.arange(len(points))), lighting)
     sky = direct.relight(np.ones((lighting.n_directions, 3), np.float32))[:, 0]
-    walls_seen = RadiositySolver(scene, lighting, points, 1024).matrix.sum(axis=1)
+    walls_seen = RadiositySolver(problem_at(scene, lighting, points), 1024).matrix.sum(axis=1)
     off = sky + walls_seen - 1
     print(f"worst vertex {np.abs(off).max():.2%}, rms {np.sqrt((off**2).mean()):.2%}, mean {off.mean():+.3%}")
     figure = Figure(figsize=(6, 3))

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import COLOURS, GREY, build, still_life
+from conftest import COLOURS, GREY, build, problem_at, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.solvers.paths import PathSolver
 
@@ -55,9 +54,7 @@ def test_errors_are_small_and_the_estimate_knows_them(scene, gathered, basis):
 
 def _paths(scene: prt.Scene, chosen: NDArray, basis: str, seed: int) -> NDArray:
     """Indirect rows of some vertices by 64 paths per element."""
-    solver = PathSolver(
-        scene.normalised, LIGHTING, vertex_points(scene), basis, max_depth=5, spp=64, seed=seed
-    )
+    solver = PathSolver(problem_at(scene, LIGHTING, basis=basis), 64, seed=seed)
     white = solver.rows(chosen).mean * LIGHTING.solid_angles[:, None]
     return scene.albedo[chosen][:, None] * white
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import T, altered, build, diffuse, problem_of
+from conftest import T, altered, build, diffuse, problem_at, problem_of
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
@@ -140,7 +140,7 @@ def test_radiance_and_terms(colour):
     truth = [rows_of(matrix) for matrix in converged(colour)]
     true = true_errors(transport, rows_of(transport), *truth)
     problem = problem_of(scene_of(colour), transport, 5)
-    check([held_out_error(problem, transport, seed) for seed in SEEDS], true)
+    check([held_out_error(problem, transport, seed).report() for seed in SEEDS], true)
 
 
 def test_the_error_of_brute_force(coloured):
@@ -151,7 +151,7 @@ def test_the_error_of_brute_force(coloured):
     few, truth = precompute(method="brute_force", spp=8, seed=5), converged(True)
     true = true_errors(few, rows_of(few), *map(rows_of, truth))
     problem = problem_of(scene_of(True), few, 5)
-    check([held_out_error(problem, few, seed) for seed in SEEDS], true)
+    check([held_out_error(problem, few, seed).report() for seed in SEEDS], true)
     more = precompute(method="brute_force", spp=128, seed=5)
     assert more.report["estimated_error"]["total"] == pytest.approx(true["total"] / 4, rel=0.25)
 
@@ -176,13 +176,13 @@ def test_texels():
                 rows + indirect_by_paths(problem, seed) for rows, seed in zip(truth, (60, 61), strict=True)
             ]
         true = true_errors(transport, rows_of(transport), *truth)
-        check([held_out_error(problem, transport, seed) for seed in SEEDS], true)
+        check([held_out_error(problem, transport, seed).report() for seed in SEEDS], true)
 
 
 def direct_by_rays(problem: Problem, seed: int) -> Doubles:
     """All rows, by 8 x 8 strata of each texel."""
     points, m = problem.points, LIGHTING.n_directions
-    rays = DirectSolver(problem.scene.normalised, LIGHTING, points, "texel", 8, seed)
+    rays = DirectSolver(problem_at(problem.scene, LIGHTING, points, basis="texel"), 8, seed=seed)
     every = np.repeat(np.arange(len(points)), m), np.tile(np.arange(m), len(points))
     found = TermRays(rays, problem.reflection).elements(*every).reshape(len(points), m, 1 + TERMS)
     return rows_in_order(problem, found[..., None])
@@ -207,7 +207,7 @@ def rows_in_order(problem: Problem, found: NDArray) -> Doubles:
 def test_a_wrong_term_is_blamed(coloured):
     """Its rows half as large again: an error of a half in that term, none in the other, and more in the whole."""
     problem = problem_of(scene_of(True), coloured, 5)
-    before = held_out_error(problem, coloured, 7)
+    before = held_out_error(problem, coloured, 7).report()
     tables = coloured.direct.tables.copy()
     tables[..., 1] *= 1.5
     left = [side.copy() for side in coloured.indirect.left]
@@ -219,7 +219,7 @@ def test_a_wrong_term_is_blamed(coloured):
         direct=replace(coloured.direct, tables=tables),
         indirect=replace(coloured.indirect, left=tuple(left)),
     )
-    after = held_out_error(problem, wrong, 7)
+    after = held_out_error(problem, wrong, 7).report()
     assert after["terms"][0] == before["terms"][0]
     assert after["terms"][1] == pytest.approx(0.5, abs=0.05)
     assert after["total"] > before["total"]
@@ -233,7 +233,7 @@ def test_a_dark_ball_is_found(coloured):
     bits[scene.meshes[1].vertices] = 0
     direct = replace(coloured.direct, visibility=replace(seen, bits=bits))
     dark = altered(coloured, direct=direct, indirect=None)
-    found = held_out_error(problem_of(scene, dark, 2), dark, 3)
+    found = held_out_error(problem_of(scene, dark, 2), dark, 3).report()
     assert found["meshes"]["ball"] == pytest.approx(1)
     assert found["terms"] == pytest.approx([1] * TERMS)
     assert found["meshes"]["ground"] < 1e-6
@@ -241,7 +241,7 @@ def test_a_dark_ball_is_found(coloured):
 
 def test_a_seed_is_a_choice(coloured):
     problem = problem_of(scene_of(True), coloured, 5)
-    first, again, other = (held_out_error(problem, coloured, seed) for seed in (0, 0, 1))
+    first, again, other = (held_out_error(problem, coloured, seed).report() for seed in (0, 0, 1))
     assert first == again
     assert first["total"] != other["total"] and first["terms"] != other["terms"]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -82,7 +82,7 @@ def compare(
     shape = (len(rows), lighting.n_directions)
     vertex, texel = np.repeat(rows, shape[1]), np.tile(np.arange(shape[1]), shape[0])
     points, channels = sensor_points(scene, rays), 1 if scene.grey else 3
-    path = PathSolver(scene.normalised, lighting, points, basis, max_depth, spp, channels, seed=1)
+    path = PathSolver(problem_at(scene, lighting, points, basis=basis, max_depth=max_depth), spp, seed=1)
     estimate = path.elements(vertex, texel)
     direct, indirect = mitsuba_columns(scene, rays.take(rows), lighting, basis, max_depth, *reference)
     result = []
@@ -278,7 +278,7 @@ def test_without_a_depth_limit(artefact):
     artefact(draw(result))
     assert_unbiased(result)
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
-    solver = PathSolver(scene.normalised, prt.CubemapLighting(2), sensor_points(scene), max_depth=5, spp=256)
+    solver = PathSolver(problem_at(scene, prt.CubemapLighting(2), sensor_points(scene)), 256)
     mean = solver.rows(rows).mean[..., 1] * solver.lighting.solid_angles * scene.albedo[rows, 1, None]
     print(f"max_depth 5 has {mean.sum() / result.ours.sum():.1%} of the light")
     assert mean.sum() < 0.8 * result.ours.sum()
@@ -327,7 +327,7 @@ def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
 
     monkeypatch.setattr(path_module, "has_mirrors", lambda _: False)
     lighting = prt.CubemapLighting(1)
-    blind = PathSolver(scene.normalised, lighting, sensor_points(scene), "texel", 5, 4096, 3).rows(rows)
+    blind = PathSolver(problem_at(scene, lighting, sensor_points(scene), basis="texel"), 4096).rows(rows)
     found = (blind.mean[..., 2] * scene.albedo[rows, 2, None] * lighting.solid_angles).sum()
     print(f"without mirror paths {found / result.theirs.sum():.1%} of the indirect light")
     assert found < 0.5 * result.theirs.sum()

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -20,7 +20,7 @@ COARSE = prt.CubemapLighting(2)
 def direct(scene: prt.Scene) -> np.ndarray:
     """All elements of the direct part, (vertices, 384)."""
     n = scene.n_vertices
-    solver = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
+    solver = DirectSolver(problem_at(scene, LIGHTING))
     white = solver.elements(np.repeat(np.arange(n), 384), np.tile(np.arange(384), n)).reshape(n, 384)
     return scene.albedo[:, :1] * white
 
@@ -28,9 +28,7 @@ def direct(scene: prt.Scene) -> np.ndarray:
 def indirect(scene: prt.Scene, seed: int, spp: int = 256) -> Estimate:
     """All elements of the indirect part at n = 2."""
     points = vertex_points(scene)
-    return PathSolver(scene.normalised, COARSE, points, spp=spp, channels=1, seed=seed).rows(
-        np.arange(len(points))
-    )
+    return PathSolver(problem_at(scene, COARSE, points), spp, seed=seed).rows(np.arange(len(points)))
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:

@@ -7,12 +7,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, GREY, T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import COLOURS, GREY, T, build, bumpy_ball, diffuse, few_held_out, mesh, problem_at, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.bits import unpack
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.settings import METHODS
@@ -34,7 +34,7 @@ HORIZON = 1e-6  # cosines below are zero, as far as float32 can tell
 @pytest.fixture(autouse=True)
 def few_held_out_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate of the error is not what is tested here, and takes longer than all the rest."""
-    monkeypatch.setattr("mi_sparse_prt.estimation.held_out.SPP", 4)
+    few_held_out(monkeypatch, spp=4)
 
 
 def precompute(scene: prt.Scene, **parameters: object) -> prt.LightTransport:
@@ -132,7 +132,7 @@ def test_the_count_itself(rays):
     assert (rays.shadow, rays.full) == (130, 107)
     rays.clear()
     # between two parallel mirrors, so to say: every path has all its bounces
-    solver = PathSolver(closed_room().normalised, LIGHTING, vertex_points(closed_room()), max_depth=5, spp=4)
+    solver = PathSolver(problem_at(closed_room(), LIGHTING), 4)
     solver.elements(np.arange(8), np.zeros(8, int))
     assert rays.full == 8 * 4 * 3
 
@@ -212,9 +212,8 @@ def stored_channels(part: Upsampled | Interpolated | LowRank | None) -> int:
 
 def test_three_channels_of_a_grey_scene_are_equal():
     scene = build(0.5, **still_life())
-    three, one = (
-        PathSolver(scene.normalised, LIGHTING, vertex_points(scene), spp=16, channels=c) for c in (3, 1)
-    )
+    three, one = (PathSolver(problem_at(scene, LIGHTING), 16) for _ in range(2))
+    three.channels = 3
     some = np.arange(0, scene.n_vertices, 7)
     in_three, in_one = three.rows(some).mean, one.rows(some).mean
     assert in_one.max() > 0.01
@@ -233,8 +232,8 @@ def test_bounces_below_the_bound_are_not_done(albedo, most):
     it is brightest.
     """
     scene = build(0.25, **still_life(((albedo,) * 3,) * 3))
-    solver = RadiositySolver(scene, LIGHTING, vertex_points(scene), 64, max_depth=12)
-    light = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
+    solver = RadiositySolver(problem_at(scene, LIGHTING, max_depth=12), 64)
+    light = DirectSolver(problem_at(scene, LIGHTING))
     even = np.stack(
         [light.elements(np.arange(scene.n_vertices), np.full(scene.n_vertices, j)) for j in (130, 150)]
     )
@@ -250,7 +249,7 @@ def test_bounces_below_the_bound_are_not_done(albedo, most):
     assert abs(found - exact).max() < 1e-3 * exact.sum(axis=1).max()
     assert abs(found - exact).max() > 0 or count == 10
     white = build(0.25, **still_life(((1.0,) * 3,) * 3))
-    every = RadiositySolver(white, LIGHTING, vertex_points(white), 64, max_depth=5)
+    every = RadiositySolver(problem_at(white, LIGHTING), 64)
     assert every.bounces(direct.sum(axis=1)) == 3
 
 
@@ -265,12 +264,12 @@ BOX = {
 }
 
 
-def by_sparse(scene: prt.Scene, direct: DirectSolver) -> NDArray[np.uint32]:
-    return sparse_parts(scene, direct, None, 0, Stopwatch(), False).direct.bits
+def by_sparse(direct: DirectSolver) -> NDArray[np.uint32]:
+    return sparse_parts(direct, None, Run()).direct.bits
 
 
-def consensual(scene: prt.Scene, direct: DirectSolver) -> NDArray[np.uint32]:
-    return by_consensus(scene, direct, Stopwatch()).visible
+def consensual(direct: DirectSolver) -> NDArray[np.uint32]:
+    return by_consensus(direct, Run()).visible
 
 
 SPARSE = {
@@ -281,8 +280,8 @@ SPARSE = {
 
 def evaluated(scene: prt.Scene, method: str) -> NDArray[np.bool_]:
     """Visibility (n_v, n_directions) by a sparse method."""
-    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
-    return unpack(SPARSE[method][0](scene, direct), N)
+    direct = DirectSolver(problem_at(scene, LIGHTING))
+    return unpack(SPARSE[method][0](direct), N)
 
 
 @pytest.mark.parametrize("shape", [BALL, BOX], ids=["ball", "box"])
@@ -372,7 +371,7 @@ def test_no_direct_ray_below_the_horizon(rays, basis):
     """
     scene = build(0.5, **still_life())
     points, strata = vertex_points(scene), 3
-    solver = DirectSolver(scene.normalised, LIGHTING, points, basis, strata)
+    solver = DirectSolver(problem_at(scene, LIGHTING, points, basis=basis), strata)
     ids = np.arange(scene.n_vertices)
     solver.rows(ids)
     in_rows = rays.shadow

@@ -1,12 +1,12 @@
 """Indirect light of ``method="sparse"`` under an even sky against brute force: a bias of 2% has to show, per mesh."""
 
 import numpy as np
+from conftest import few_held_out
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.estimation import held_out
-from mi_sparse_prt.methods import sparse
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.scene.scene import Scene
 
 LIGHTING = prt.CubemapLighting(
@@ -16,7 +16,7 @@ NAMES = ("ground", "ball", "box", "all")
 BIAS = 0.01  # what interpolation along the surface and in angle may cost so small a scene
 
 
-def mean_indirect(scene: Scene, method: str, spp: int, seeds: range) -> NDArray[np.float64]:
+def mean_indirect(scene: Scene, method: str | Plan, spp: int, seeds: range) -> NDArray[np.float64]:
     """White indirect light under an even sky, mean over the vertices of each mesh and of all, (seeds, 4)."""
     even, means = np.ones((LIGHTING.n_directions, 3), np.float32), []
     for seed in seeds:
@@ -61,9 +61,8 @@ def test_noise_is_taken_out_and_light_is_not(grey_scene, monkeypatch, artefact):
     Standard errors are below 0.5%, so that a bias of 2% does not pass; below 1% on the ground, which has little light
     and much noise.
     """
-    monkeypatch.setattr(sparse, "DENSE", 1.0)
-    monkeypatch.setattr(held_out, "SPP", 2)  # the estimate of the error is not asked for
-    ours = mean_indirect(grey_scene, "sparse", 8, range(6))
+    few_held_out(monkeypatch, spp=2)  # the estimate of the error is not asked for
+    ours = mean_indirect(grey_scene, Plan("sparse", "sparse", dense=1.0), 8, range(6))
     true = mean_indirect(grey_scene, "brute_force", 4, range(100, 103))
     difference, error = bias(ours, true)
     artefact(draw(ours, true))

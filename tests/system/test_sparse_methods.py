@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.bits import unpack
+from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.huang2010 import whole_rows
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.visibility import Visibility
@@ -106,7 +107,7 @@ class Counter:
         pipeline = importlib.import_module("mi_sparse_prt.precompute")
         held_out_error = pipeline.held_out_error
 
-        def uncounted(*arguments: Any) -> dict[str, Any]:
+        def uncounted(*arguments: Any) -> HeldOutError:
             paths = self.paths
             found = held_out_error(*arguments)
             self.paths = paths

@@ -8,7 +8,7 @@ Rows are independent of each other, elements of an adjoint row are not: standard
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import COLOURS, T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 from matplotlib.figure import Figure
 
 import mi_sparse_prt as prt
@@ -98,15 +98,9 @@ def test_adjoint_rows_are_path_traced_elements(coloured_scene, artefact, max_dep
     spread of 0.9 to 1.1.
     """
     ids = np.arange(coloured_scene.n_vertices)
-    shared = (
-        coloured_scene.normalised,
-        prt.CubemapLighting(2),
-        vertex_points(coloured_scene),
-        basis,
-        max_depth,
-    )
-    ours = AdjointSolver(*shared, spp=128, seed=1).rows(ids)
-    theirs = PathSolver(*shared, spp=256, seed=2).rows(ids)
+    problem = problem_at(coloured_scene, prt.CubemapLighting(2), basis=basis, max_depth=max_depth)
+    ours = AdjointSolver(problem, spp=128, seed=1).rows(ids)
+    theirs = PathSolver(problem, spp=256, seed=2).rows(ids)
     artefact(draw(ours, theirs))
     assert_agree(ours, theirs)
 
@@ -124,9 +118,9 @@ def test_glass_metal_and_mirrors(artefact, basis, n):
     """
     scene = glossy_scene()
     ids = np.arange(scene.meshes[0].vertices.stop)
-    shared = (scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, 5)
-    ours = AdjointSolver(*shared, spp=1024, seed=1).rows(ids)
-    theirs = PathSolver(*shared, spp=1024, seed=2).rows(ids)
+    problem = problem_at(scene, prt.CubemapLighting(n), basis=basis, max_depth=5)
+    ours = AdjointSolver(problem, spp=1024, seed=1).rows(ids)
+    theirs = PathSolver(problem, spp=1024, seed=2).rows(ids)
     artefact(draw(ours, theirs))
     assert_agree(ours, theirs, 0.05)
 
@@ -164,7 +158,7 @@ def test_row_sums_under_even_light(coloured_scene):
     Result: total z within 1.9, standard errors of 0.4%.
     """
     scene, lighting = coloured_scene, prt.CubemapLighting(4)
-    adjoint = AdjointSolver(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=4, spp=16)
+    adjoint = AdjointSolver(problem_at(scene, lighting, sensor_points(scene), basis="texel", max_depth=4), 16)
     ids = np.arange(scene.n_vertices)
     sums = [
         np.einsum("ijc,j,ic->c", adjoint.rows(ids, seed=k).mean, lighting.solid_angles, scene.albedo)
@@ -193,7 +187,7 @@ def test_inner_product(coloured_scene):
     """
     scene, lighting = coloured_scene, prt.CubemapLighting(2)
     rng = np.random.default_rng(3)
-    adjoint = AdjointSolver(scene.normalised, lighting, sensor_points(scene), "texel", max_depth=5, spp=64)
+    adjoint = AdjointSolver(problem_at(scene, lighting, sensor_points(scene), basis="texel"), 64)
     ids = np.arange(scene.n_vertices)
     # T[seed, row, texel, channel]
     rows = np.array([adjoint.rows(ids, seed=k).mean.astype(np.float64) for k in range(8)])
@@ -221,7 +215,7 @@ def test_inner_product(coloured_scene):
 
 def direct_part(scene: prt.Scene, lighting: prt.CubemapLighting) -> MeanCosine:
     points = vertex_points(scene)
-    solver = DirectSolver(scene.normalised, lighting, points, "texel", strata=4)
+    solver = DirectSolver(problem_at(scene, lighting, points, basis="texel"), 4)
     return MeanCosine(solver.rows(np.arange(len(points))), lighting)
 
 
@@ -238,10 +232,10 @@ def test_finite_elements_among_the_others(artefact):
     """
     scene, lighting = build(0.1, **still_life(COLOURS)), prt.CubemapLighting(2)
     ids = np.sort(np.random.default_rng(4).choice(scene.n_vertices, 200, replace=False))
-    shared = (scene.normalised, lighting, vertex_points(scene), "texel", 5)
-    adjoint = AdjointSolver(*shared, spp=128, seed=1).rows(ids)
-    paths = PathSolver(*shared, spp=256, seed=2).rows(ids)
-    gather = RadiositySolver(scene, lighting, vertex_points(scene), 512, max_depth=5)
+    problem = problem_at(scene, lighting, basis="texel", max_depth=5)
+    adjoint = AdjointSolver(problem, spp=128, seed=1).rows(ids)
+    paths = PathSolver(problem, spp=256, seed=2).rows(ids)
+    gather = RadiositySolver(problem_at(scene, lighting), 512)
     found = gather.rows(direct_part(scene, lighting), ids) / lighting.solid_angles[:, None]
     artefact(draw(adjoint, paths))
     assert_agree(adjoint, paths, bias=0.05)
@@ -267,7 +261,7 @@ def test_inner_product_of_finite_elements(coloured_scene, most_nodes):
     lighting, rng = prt.CubemapLighting(4), np.random.default_rng(3)
     points = vertex_points(coloured_scene)
     nodes = choose_nodes(coloured_scene, points, most_nodes, small=50)
-    gather = RadiositySolver(coloured_scene, lighting, points, 64, nodes=nodes)
+    gather = RadiositySolver(problem_at(coloured_scene, lighting, points), 64, nodes=nodes)
     assert (len(gather.nodes) < 200) == (most_nodes == 150)
     direct = direct_part(coloured_scene, lighting)
     rows = gather.rows(direct, np.arange(coloured_scene.n_vertices)).astype(np.float64)
@@ -299,7 +293,7 @@ def test_a_closed_box_is_dark(basis):
     place = T().rotate([0, 1, 0], 17).rotate([1, 0, 0], 29)
     box = {"type": "cube", "flip_normals": True, "to_world": place, "bsdf": diffuse(0.8, 0.8, 0.8)}
     scene = build(0.5, ball=mesh("ball", vertices, triangles, diffuse(0.5, 0.5, 0.5)), box=box)
-    shared = (scene.normalised, prt.CubemapLighting(4), vertex_points(scene), basis, 6)
-    estimate = AdjointSolver(*shared, spp=4, channels=1).rows(np.arange(scene.n_vertices))
+    problem = problem_at(scene, prt.CubemapLighting(4), basis=basis, max_depth=6)
+    estimate = AdjointSolver(problem, spp=4).rows(np.arange(scene.n_vertices))
     assert not estimate.mean.any()
     assert not estimate.variance.any()

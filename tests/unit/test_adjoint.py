@@ -1,29 +1,38 @@
 """Rows of indirect light from shared paths: the estimator's bookkeeping, statistics and reach."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 from scipy import stats
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.kernels import launched_kernels
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import adjoint_paths as adjoint_module
 from mi_sparse_prt.solvers.adjoint_paths import AdjointSolver
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 
+def made(kind: type, problem: Problem, max_depth: int = 5, channels: int | None = None, **parameters: int):
+    """A solver, of fewer or more channels than the scene's colours ask for."""
+    found = kind(replace(problem, max_depth=max_depth), **parameters)
+    found.channels = channels or found.channels
+    return found
+
+
 def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> AdjointSolver:
-    return AdjointSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+    return made(AdjointSolver, problem_at(scene, prt.CubemapLighting(n), basis=basis), **parameters)
 
 
 def paths(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathSolver:
-    return PathSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+    return made(PathSolver, problem_at(scene, prt.CubemapLighting(n), basis=basis), **parameters)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import GREY, build, still_life
+from conftest import GREY, build, problem_at, still_life
 from interior_point import interior_point_fit
 
 import mi_sparse_prt as prt
@@ -34,15 +34,16 @@ from mi_sparse_prt.benchmark.column_sampling import (
 from mi_sparse_prt.benchmark.exact_rows import mesh_named, trace_visibility, unit_albedo_rows
 from mi_sparse_prt.core.bits import pack, unpack
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
-from mi_sparse_prt.methods.huang2010 import RELATIVE_LAMBDA
+from mi_sparse_prt.methods.huang2010 import Huang2010Options
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 RESOLUTION, VERTICES = 8, 40
 CHOICES = [random_columns, clustered_columns, k_means_columns]
+
+LAMBDA = Huang2010Options().relative_lambda
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def _cuts(order: np.ndarray) -> list:
 
 def test_exact_rows_are_those_of_brute_force(scene: prt.Scene, lighting: prt.CubemapLighting) -> None:
     ids = np.arange(0, len(scene.positions), 7)
-    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
+    direct = DirectSolver(problem_at(scene, lighting))
     unit_albedo = unit_albedo_rows(trace_visibility(direct, ids), scene.normals[ids], lighting)
     matrix = prt.precompute(scene, lighting, method="brute_force", max_depth=2, progress=False)
     expected = matrix.rows(ids)[..., 0] / scene.albedo[ids, :1]
@@ -173,8 +174,8 @@ def test_features_of_exact_rows_are_those_that_rays_find(
 ) -> None:
     inside = mesh_named(scene, "ball").vertices
     ids = np.arange(0, inside.stop - inside.start, 3)
-    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
-    sampler = DenseSampler(scene, direct, AngularGrid(lighting), Stopwatch())
+    direct = DirectSolver(problem_at(scene, lighting))
+    sampler = DenseSampler(direct, AngularGrid(lighting), Run())
     sampler.add(ids + inside.start)
     dense = sampler.dense()
     assert np.array_equal(np.sort(dense.ids), ids + inside.start)
@@ -226,7 +227,7 @@ def test_errors_are_those_of_vertices_one_at_a_time(scene: prt.Scene, lighting: 
         best = [j for j in np.argsort(-weight, kind="stable")[:23] if weight[j] > 0]
         A, y = rows[near][:, best].T, exact[best]
         products = (A.T @ A)[None], (A.T @ y)[None], (y @ y)[None]
-        a = interior_point_fit(*products, RELATIVE_LAMBDA).weights[0]
+        a = interior_point_fit(*products, LAMBDA).weights[0]
         squared += ((a @ rows[near] - exact) ** 2).sum()
     assert np.sqrt(_by_vertex(local, 23, 1).squared.sum()) == pytest.approx(np.sqrt(squared), rel=1e-3)
 
@@ -247,7 +248,7 @@ def test_rows_of_rank_one_are_known_but_for_the_shrinkage(name: str) -> None:
         else _by_region(local, region, BY_REGION[name], 5, seed=0)
     )
     assert result.directions == 5
-    assert np.sqrt(result.squared) == pytest.approx(RELATIVE_LAMBDA * np.linalg.norm(exact, axis=1), rel=1e-3)
+    assert np.sqrt(result.squared) == pytest.approx(LAMBDA * np.linalg.norm(exact, axis=1), rel=1e-3)
 
 
 def test_where_nothing_is_sampled_neighbours_have_their_mean() -> None:

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import build, diffuse
+from conftest import build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
@@ -130,11 +130,11 @@ def test_errors_at_a_contact_shrink():
     scene, lighting = build(0.1, ground=GROUND, ball=BALL), LIGHTING
     points, near = vertex_points(scene), np.linalg.norm(scene.positions, axis=1)
     ids = np.setdiff1d(np.nonzero(near < 0.35)[0], contacts(scene, lighting).vertices)
-    paths = PathSolver(scene.normalised, lighting, points, "direction", 3, 4096, 1)
+    paths = PathSolver(problem_at(scene, lighting, points, max_depth=3), 4096)
     every = np.repeat(ids, lighting.n_directions), np.tile(np.arange(lighting.n_directions), len(ids))
     shape = len(ids), lighting.n_directions
     true = paths.elements(*every, 0).mean.reshape(shape) * lighting.solid_angles
-    direct = DirectSolver(scene.normalised, lighting, points)
+    direct = DirectSolver(problem_at(scene, lighting, points))
     found = prt.precompute(scene, lighting, Plan("exact", "gather", 1024, 0.001), max_depth=3, progress=False)
     ours = found.indirect.elements(*every).reshape(shape)
     light = direct.elements(

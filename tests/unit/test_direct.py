@@ -4,17 +4,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import build, diffuse, mesh
+from conftest import build, diffuse, mesh, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
-from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import FIXED_POINT, DirectSolver
 
 
 def solver(scene: Scene, n: int, basis: str = "direction", **parameters: int) -> DirectSolver:
-    return DirectSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+    return DirectSolver(problem_at(scene, prt.CubemapLighting(n), basis=basis), **parameters)
 
 
 def every(direct: DirectSolver) -> tuple[np.ndarray, np.ndarray]:

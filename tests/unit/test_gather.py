@@ -7,7 +7,7 @@ import numba
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import COLOURS, T, build, diffuse, still_life
+from conftest import COLOURS, T, build, diffuse, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
@@ -30,13 +30,15 @@ WHITE = diffuse(1, 1, 1)
 ROOM = {"type": "cube", "flip_normals": True}
 
 
-def solver(scene: Scene, n: int = 2, rays: int = 64, **parameters: int) -> RadiositySolver:
-    return RadiositySolver(scene, prt.CubemapLighting(n), vertex_points(scene), rays, **parameters)
+def solver(
+    scene: Scene, n: int = 2, rays: int = 64, max_depth: int = 5, **parameters: int
+) -> RadiositySolver:
+    return RadiositySolver(problem_at(scene, prt.CubemapLighting(n), max_depth=max_depth), rays, **parameters)
 
 
 def visibility(scene: Scene, n: int = 4) -> Visibility:
     lighting, points = prt.CubemapLighting(n), vertex_points(scene)
-    bits = DirectSolver(scene.normalised, lighting, points).rows(np.arange(len(points)))
+    bits = DirectSolver(problem_at(scene, lighting, points)).rows(np.arange(len(points)))
     return Visibility(bits, scene.normals, lighting)
 
 
@@ -249,7 +251,7 @@ def test_light_that_never_ends():
 def direct_parts(scene: Scene) -> dict:
     bits = visibility(scene)
     lighting, points = bits.lighting, vertex_points(scene)
-    texel = DirectSolver(scene.normalised, lighting, points, "texel")
+    texel = DirectSolver(problem_at(scene, lighting, points, basis="texel"))
     n, rng = scene.n_vertices, np.random.default_rng(0)
     weights = scipy.sparse.random_array((n, 60), density=0.1, rng=rng, dtype=np.float32).tocsr()
     dense = bits.take(np.sort(rng.choice(n, 60, replace=False)))

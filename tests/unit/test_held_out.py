@@ -12,7 +12,7 @@ from conftest import mesh as mesh_of
 import mi_sparse_prt as prt
 from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.estimation import element_sampling, held_out
-from mi_sparse_prt.estimation.element_sampling import for_direct_light, for_indirect_light
+from mi_sparse_prt.estimation.element_sampling import Effort, for_direct_light, for_indirect_light
 from mi_sparse_prt.estimation.held_out import Sample, relative
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.operators.interpolated import Interpolated
@@ -28,12 +28,17 @@ SEEDS = range(6)
 
 
 def held_out_error(
-    scene: prt.Scene, transport: LightTransport, max_depth: int, seed: int, target: float | None = None
+    scene: prt.Scene,
+    transport: LightTransport,
+    max_depth: int,
+    seed: int,
+    target: float | None = None,
+    effort: Effort = Effort(),  # noqa: B008  frozen
 ) -> dict:
     """Of a matrix of diffuse vertices."""
     points, surfaces = mesh_vertices(scene), Diffuse(scene.albedo)
     problem = Problem(scene, transport.emission, points, surfaces, transport.basis, max_depth)
-    return held_out.held_out_error(problem, transport, seed, target)
+    return held_out.held_out_error(problem, transport, seed, target, effort).report()
 
 
 def row_sample(weights: np.ndarray, squares: np.ndarray, norms: np.ndarray) -> Sample:
@@ -182,17 +187,12 @@ def test_a_seed_is_a_choice(exact):
 # ------------------------------------------------------------------------------------ few elements
 
 
-@pytest.fixture
-def few(monkeypatch):
-    """About 1500 rays and 150 elements by paths for a mesh."""
-    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 1500)
-    monkeypatch.setattr(element_sampling, "PATHS", 150)
-    monkeypatch.setattr(element_sampling, "FEW_PATHS", 150)
-    monkeypatch.setattr(held_out, "SPP", 128)
+FEW = Effort(fewest_rays=1500, paths=150, few_paths=150, spp=128)  # for a mesh
+SOME = Effort(fewest_rays=16_000)
 
 
 @pytest.mark.parametrize("where", ["anywhere", "one vertex"])
-def test_rare_wrong_bits(exact, monkeypatch, where):
+def test_rare_wrong_bits(exact, where):
     """1 of 2000 visible bits is wrong; or all of one vertex in each mesh. A tenth of the elements is looked at.
 
     Rationale: errors of visibility are few and large, and a handful of vertices can hold most of them.
@@ -201,7 +201,6 @@ def test_rare_wrong_bits(exact, monkeypatch, where):
     is small enough to see a bias of 2% of the error; at least 85% of the intervals of +-2 reported standard errors
     hold the truth, and the reported ones are as large as the spread of the estimates (40 say that within a third).
     """
-    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 16_000)
     scene, transport = exact
     truth = [transport.rows(np.arange(scene.n_vertices)).astype(np.float64)] * 2
     if where == "anywhere":
@@ -211,7 +210,7 @@ def test_rare_wrong_bits(exact, monkeypatch, where):
         bits[[m.vertices.start + 7 for m in scene.meshes]] = 0
         wrong = with_bits(transport, bits)
     true = errors_of(scene, wrong, truth)["total"]
-    reports = [held_out_error(scene, wrong, 2, seed) for seed in range(40)]
+    reports = [held_out_error(scene, wrong, 2, seed, effort=SOME) for seed in range(40)]
     found = np.array([r["total"] for r in reports])
     errors = np.array([r["standard_error"]["total"] for r in reports])
     spread = (found**2).std(ddof=1) / np.sqrt(len(found))
@@ -221,19 +220,18 @@ def test_rare_wrong_bits(exact, monkeypatch, where):
     assert 0.67 < np.sqrt((errors**2).mean()) / found.std() < 1.5
 
 
-def test_a_target_far_off_takes_a_quarter(exact, monkeypatch):
+def test_a_target_far_off_takes_a_quarter(exact):
     """
     Expected: a quarter of the elements where the target is far off; estimates without bias (3 standard errors, that
         would show 2% of the error), twice as far from the truth on average, and reported so. Where the error is the
         target, nearly all of them, and as good an estimate as without a target.
     """
-    monkeypatch.setattr(element_sampling, "FEWEST_RAYS", 16_000)
     scene, transport = exact
     truth = [transport.rows(np.arange(scene.n_vertices)).astype(np.float64)] * 2
     wrong = flipped(transport, 4000, seed=1)
     true = errors_of(scene, wrong, truth)["total"]
     usual, less, near = (
-        [held_out_error(scene, wrong, 2, seed, target) for seed in range(count)]
+        [held_out_error(scene, wrong, 2, seed, target, SOME) for seed in range(count)]
         for target, count in ((None, 40), (100 * true, 160), (true, 40))
     )
     elements = [np.mean([r["elements"] for r in reports]) for reports in (usual, less, near)]
@@ -258,7 +256,7 @@ def test_a_target_far_off_takes_a_quarter(exact, monkeypatch):
         ("huang2010", "direction"),
     ],
 )
-def test_intervals_from_few_elements(grey_scene, few, method, basis):
+def test_intervals_from_few_elements(grey_scene, method, basis):
     """150 elements of each mesh by paths, at most 1500 by rays, 25 times.
 
     Expected: intervals of 2 standard errors hold the true error (against a converged matrix) in at least 85% of the
@@ -270,7 +268,9 @@ def test_intervals_from_few_elements(grey_scene, few, method, basis):
     )
     truth = converged(grey_scene, basis)
     true = errors_of(grey_scene, transport, truth)
-    reports = [estimates(held_out_error(grey_scene, transport, 5, seed)) for seed in range(100, 125)]
+    reports = [
+        estimates(held_out_error(grey_scene, transport, 5, seed, effort=FEW)) for seed in range(100, 125)
+    ]
     found, errors = (np.array([[part[i][k] for k in true] for part in reports]) for i in (0, 1))
     expected = np.array(list(true.values()))  # total and meshes
     inside = np.abs(found - expected) / errors  # [seed, total and meshes]
@@ -381,8 +381,11 @@ def test_weighted_sums_are_those_of_all_elements(exact):
     inside = scene.meshes[1].vertices
     values = np.random.default_rng(4).random((scene.n_vertices, lighting.n_directions)) + 0.5
     above = scene.normals @ lighting.directions.T > 0
-    direct = [for_direct_light(transport, scene.normals, inside, np.random.default_rng(k)) for k in range(50)]
-    indirect = [for_indirect_light(transport, inside, np.random.default_rng(k)) for k in range(50)]
+    direct = [
+        for_direct_light(transport, scene.normals, inside, np.random.default_rng(k), Effort())
+        for k in range(50)
+    ]
+    indirect = [for_indirect_light(transport, inside, np.random.default_rng(k), Effort()) for k in range(50)]
     for drawn, all_values in ((direct, values * above), (indirect, values)):
         sums = np.array([(c.weights * all_values[c.vertices, c.texels]).sum() for c in drawn])
         error = sums.std(ddof=1) / np.sqrt(len(sums))
@@ -404,7 +407,9 @@ def test_every_vertex_is_looked_at_and_all_edges(exact):
     """
     scene, transport = exact
     directions = transport.lighting.directions
-    found = for_direct_light(transport, scene.normals, slice(0, scene.n_vertices), np.random.default_rng(0))
+    found = for_direct_light(
+        transport, scene.normals, slice(0, scene.n_vertices), np.random.default_rng(0), Effort()
+    )
     assert set(found.vertices) == set(range(scene.n_vertices))
     bits = np.unpackbits(transport.direct.bits.view(np.uint8), axis=1, bitorder="little")
     factors = {}

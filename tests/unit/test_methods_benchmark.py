@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from conftest import COLOURS, T, altered, build, diffuse, still_life
+from conftest import COLOURS, T, altered, build, diffuse, problem_at, still_life
 from rich.console import Console
 
 import mi_sparse_prt as prt
@@ -31,7 +31,6 @@ from mi_sparse_prt.benchmark.relit_reference import (
 from mi_sparse_prt.benchmark.sampled_norms import joint_relative_l2, mean_square, sampled_relative_l2
 from mi_sparse_prt.cli.tables.methods import methods_tables
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.solvers.paths import PathSolver
 
 SCENE = """<scene version="3.0.0">
@@ -165,16 +164,7 @@ def test_path_traced_light_is_that_of_the_elements(coloured, grey_scene, small_l
     lights[1, 17] = [30, 20, 10]
     vertices = np.arange(0, len(scene.positions), 40)
     runs = np.stack([path_traced(scene, small_lighting, lights, vertices, 2048, seed) for seed in range(6)])
-    solver = PathSolver(
-        scene.normalised,
-        small_lighting,
-        vertex_points(scene),
-        "direction",
-        5,
-        2048,
-        3 if coloured else 1,
-        seed=9,
-    )
+    solver = PathSolver(problem_at(scene, small_lighting), 2048, seed=9)
     rows = solver.rows(vertices)
     weights = small_lighting.solid_angles[:, None].astype(np.float64)
     expected = np.einsum("vjc,ljc->lvc", rows.mean * weights, lights)

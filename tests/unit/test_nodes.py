@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import COLOURS, build, still_life
+from conftest import COLOURS, build, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
@@ -72,7 +72,9 @@ def test_the_result_does_not_depend_on_the_order_of_shapes(scene):
     def found(some: Scene) -> tuple[np.ndarray, np.ndarray]:
         points = vertex_points(some)
         order = np.argsort(points.keys)
-        gather = RadiositySolver(some, lighting, points, 64, nodes=choose_nodes(some, points, 800))
+        gather = RadiositySolver(
+            problem_at(some, lighting, points), 64, nodes=choose_nodes(some, points, 800)
+        )
         light = np.maximum(some.normals[:, 1:2], 0)
         return np.sort(points.keys[gather.nodes.ids]), gather.apply(light)[order, 0]
 
@@ -87,8 +89,8 @@ def test_fewer_nodes_fewer_rays_and_nearly_the_same_light(scene):
     """A quarter of the vertices of the larger meshes: indirect light within 8% of that of all, the mean within 1%."""
     points, lighting = vertex_points(scene), prt.CubemapLighting(2)
     light = np.maximum(0.5 + 0.5 * scene.normals[:, 1:2], 0)
-    every = RadiositySolver(scene, lighting, points, 256)
-    some = RadiositySolver(scene, lighting, points, 256, nodes=choose_nodes(scene, points, 800))
+    every = RadiositySolver(problem_at(scene, lighting, points), 256)
+    some = RadiositySolver(problem_at(scene, lighting, points), 256, nodes=choose_nodes(scene, points, 800))
     assert some.rays == 256 * len(some.nodes) < 0.6 * every.rays
     known, found = every.apply(light), some.apply(light)
     assert np.linalg.norm(found - known) < 0.08 * np.linalg.norm(known)

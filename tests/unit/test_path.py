@@ -3,11 +3,10 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
+from conftest import T, build, diffuse, problem_at
 from scipy import stats
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import paths as path_module
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -15,8 +14,19 @@ from mi_sparse_prt.solvers.paths import PathSolver
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 
-def solver(scene: Scene, n: int = 2, basis: str = "direction", **parameters: int) -> PathSolver:
-    return PathSolver(scene.normalised, prt.CubemapLighting(n), vertex_points(scene), basis, **parameters)
+def solver(
+    scene: Scene,
+    n: int = 2,
+    basis: str = "direction",
+    max_depth: int = 5,
+    channels: int | None = None,
+    **parameters: int,
+) -> PathSolver:
+    """Of fewer or more channels than the scene's colours ask for, if wanted."""
+    problem = problem_at(scene, prt.CubemapLighting(n), basis=basis, max_depth=max_depth)
+    found = PathSolver(problem, **parameters)
+    found.channels = channels or found.channels
+    return found
 
 
 @pytest.mark.parametrize("basis", ["direction", "texel"])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
@@ -11,7 +12,7 @@ LIGHTING = prt.CubemapLighting(4)
 
 def test_the_choice_of_elements(grey_scene):
     def drawn(seed: int, *counts: int) -> PilotElements:
-        return PilotElements(grey_scene, LIGHTING, "direction", 2, False, seed, *counts)
+        return PilotElements(problem_at(grey_scene, LIGHTING, max_depth=2), False, seed, *counts)
 
     held, other, everything = drawn(0, 20, 7), drawn(1, 20, 7), drawn(0, 10**6, 10**6)
     assert held.vertices.shape == (60,)
@@ -27,7 +28,7 @@ def test_the_choice_of_elements(grey_scene):
 
 def test_the_squared_error_of_a_matrix(grey_scene):
     """A direct matrix 10% too bright: exactly, a hundredth of the squared norm."""
-    held = PilotElements(grey_scene, LIGHTING, "direction", 2, False, seed=0)
+    held = PilotElements(problem_at(grey_scene, LIGHTING, max_depth=2), False, seed=0)
     transport = prt.precompute(grey_scene, LIGHTING, "brute_force", max_depth=2, progress=False)
     ours = 1.1 * transport.rows(held.vertices)
     squares = held.squared_error(np.take_along_axis(ours, held.texels[..., None], axis=1))

@@ -8,12 +8,11 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import GREY, build, diffuse, still_life
+from conftest import GREY, build, diffuse, problem_at, still_life
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.core.profiling import Stopwatch
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
@@ -35,7 +34,6 @@ from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import MOST
-from mi_sparse_prt.solvers.problem import diffuse_problem
 
 LIGHTING = prt.CubemapLighting(4)
 EXACT = {"exact": DirectCost(10.0, 0.0)}
@@ -164,10 +162,8 @@ def test_after_a_miss_as_if_all_predictions_were_as_far_off():
 
 def test_gathering_learns_its_bias(grey_scene):
     """The error that was found is then the one that is predicted, and noise falls from there."""
-    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
-    costs = measure(
-        diffuse_problem(grey_scene, direct.lighting), direct, Settings(4, max_depth=4), indirect=True
-    ).gather
+    direct = DirectSolver(problem_at(grey_scene, LIGHTING, max_depth=4))
+    costs = measure(direct, Settings(4, max_depth=4), indirect=True).gather
     assert costs is not None
     for error in (0.5 * costs.error(64, 0.06), 2 * costs.error(64, 0.06)):
         now = costs.learned(64, 0.06, error)
@@ -343,8 +339,8 @@ def test_a_plan_is_carried_out(grey_scene):
         "parameters": {"resolution": 2, "spp": 3},
     }
 
-    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene))
-    state = by_consensus(grey_scene, direct, Stopwatch())
+    direct = DirectSolver(problem_at(grey_scene, LIGHTING))
+    state = by_consensus(direct, Run())
     mixed = prt.precompute(grey_scene, LIGHTING, Plan("consensus", "gather", 64, 0.06), progress=False)
     assert np.array_equal(mixed.direct.bits, state.visible)
     evaluated = int(np.bitwise_count(state.evaluated).sum())
@@ -359,11 +355,11 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
     """The error of small meshes, of which all is tried, against that of the whole matrix."""
     assert all(mesh.vertices.stop - mesh.vertices.start <= PATCH for mesh in grey_scene.meshes)
     lighting = prt.CubemapLighting(8)
-    direct = DirectSolver(grey_scene.normalised, lighting, vertex_points(grey_scene))
-    held = PilotElements(grey_scene, lighting, "direction", 2, False, 0)
-    predicted = consensus_cost(grey_scene, direct, held, 0).error
-    held = PilotElements(grey_scene, lighting, "direction", 5, True, 0)
-    of_whole = consensus_cost(grey_scene, direct, held, 0).error
+    direct = DirectSolver(problem_at(grey_scene, lighting))
+    held = PilotElements(problem_at(grey_scene, lighting, max_depth=2), False, seed=0)
+    predicted = consensus_cost(direct, held, 0).error
+    held = PilotElements(problem_at(grey_scene, lighting), True, seed=0)
+    of_whole = consensus_cost(direct, held, 0).error
     exact, ours = (
         prt.precompute(grey_scene, lighting, Plan(how, "none"), progress=False).rows(
             range(grey_scene.n_vertices)
@@ -387,10 +383,8 @@ def test_predicted_errors_are_those_of_the_matrix():
     1.048 +- 0.039; one seed is within three of the latter of the former.
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
-    direct = DirectSolver(scene.normalised, lighting, vertex_points(scene))
-    costs = measure(
-        diffuse_problem(scene, direct.lighting), direct, Settings(8, target_error=0.04), indirect=True
-    )
+    direct = DirectSolver(problem_at(scene, lighting))
+    costs = measure(direct, Settings(8, target_error=0.04), indirect=True)
     assert costs.paths is not None and costs.gather is not None
     plans = [
         (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.969, 0.038),
@@ -405,13 +399,8 @@ def test_predicted_errors_are_those_of_the_matrix():
 
 @pytest.mark.parametrize("indirect", [True, False])
 def test_costs_of_what_is_left_open(grey_scene, indirect):
-    direct = DirectSolver(grey_scene.normalised, LIGHTING, vertex_points(grey_scene), "texel")
-    costs = measure(
-        diffuse_problem(grey_scene, direct.lighting),
-        direct,
-        Settings(4, basis="texel", indirect_resolution=2),
-        indirect,
-    )
+    direct = DirectSolver(problem_at(grey_scene, LIGHTING, basis="texel"))
+    costs = measure(direct, Settings(4, basis="texel", indirect_resolution=2), indirect)
     assert costs.direct.keys() == {"exact", "edges"}  # consensus and "sparse" are of the other basis
     assert 0 < costs.direct["edges"].error < costs.direct["exact"].error
     assert costs.sparse is None
@@ -427,8 +416,8 @@ def test_a_room_without_light():
     room = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*GREY[0])}
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": diffuse(*GREY[0])}
     scene = build(0.5, room=room, box=box)
-    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
-    costs = measure(diffuse_problem(scene, direct.lighting), direct, Settings(4, max_depth=4), indirect=True)
+    direct = DirectSolver(problem_at(scene, LIGHTING, max_depth=4))
+    costs = measure(direct, Settings(4, max_depth=4), indirect=True)
     assert costs.gather is not None
     assert costs.gather.rank(0.03) == costs.gather.error(64, 0.06) == 0
     assert costs.direct["consensus"].error == 0
@@ -440,9 +429,7 @@ def test_other_materials_are_not_gathered_from():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", prt.PrtWarning)
         scene = build(0.5, **shapes)
-    direct = DirectSolver(scene.normalised, LIGHTING, vertex_points(scene))
-    costs = measure(
-        diffuse_problem(scene, direct.lighting), direct, Settings(4, max_depth=3, spp=2), indirect=True
-    )
+    direct = DirectSolver(problem_at(scene, LIGHTING, max_depth=3))
+    costs = measure(direct, Settings(4, max_depth=3, spp=2), indirect=True)
     assert costs.gather is None
     assert costs.paths is not None and costs.sparse is not None

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import build, diffuse, mesh, still_life
+from conftest import build, diffuse, mesh, problem_at, still_life
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from interior_point import interior_point_fit
@@ -16,7 +16,6 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.least_squares import least_squares_fit
 from mi_sparse_prt.core.bits import pack, unpack
 from mi_sparse_prt.measurement.neighbours import Neighbours, surface_neighbours
-from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.reconstruction.denoising import denoise_rows
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 from mi_sparse_prt.reconstruction.l1 import l1_fit
@@ -378,7 +377,7 @@ def test_what_a_bsdf_gives_has_to_be_finite(value, place, method):
     named = np.array(found[3].split(","), float)
     np.testing.assert_allclose(named, lighting.directions[texel], atol=1e-4)
 
-    path = PathSolver(scene.normalised, lighting, vertex_points(scene), max_depth=4, spp=4, channels=3)
+    path = PathSolver(problem_at(scene, lighting, max_depth=4), 4)
     if method == "brute_force":  # with the same random numbers
         with pytest.raises(prt.PrtError, match=f"vertex {vertex} "):
             path.elements(np.array([vertex]), np.array([texel]))
@@ -392,7 +391,7 @@ def test_the_plugin_is_not_what_fails():
     """With 0.5 in the strip too it is the built-in BSDF of that reflectance."""
     ids = np.arange(0, 313, 5)
     ours, theirs = (
-        PathSolver(s.normalised, prt.CubemapLighting(2), vertex_points(s), channels=1).rows(ids).mean
+        PathSolver(problem_at(s, prt.CubemapLighting(2))).rows(ids).mean
         for s in (broken(0.5, "eval"), with_ground(diffuse(0.5, 0.5, 0.5)))
     )
     np.testing.assert_allclose(ours.sum(), theirs.sum(), rtol=0.05)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
+from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.measurement import mesh_vertices
@@ -79,9 +79,9 @@ def test_white_light_is_that_of_path_transport(grey_scene, max_depth):
     rng = np.random.default_rng(1)
     ids = rng.integers(0, grey_scene.n_vertices, 500), rng.integers(0, lighting.n_directions, 500)
     found = TermPaths(problem, 8, seed=5).elements(*ids)
-    known = PathSolver(
-        grey_scene.normalised, lighting, points, "direction", max_depth, 8, 1, seed=5
-    ).elements(*ids)
+    known = PathSolver(problem_at(grey_scene, lighting, points, max_depth=max_depth), 8, seed=5).elements(
+        *ids
+    )
     assert found.mean.shape == found.variance.shape == (500, 3)
     assert np.count_nonzero(known.mean) > 50
     np.testing.assert_allclose(found.mean[:, :1], known.mean, rtol=1e-6)
@@ -126,7 +126,7 @@ def test_negative_bsdfs_change_the_sign_of_each_bounce():
     points = vertex_points(positive)  # for both: random numbers are those of points
 
     def found(scene: Scene, max_depth: int) -> np.ndarray:
-        paths = PathSolver(scene.normalised, lighting, points, "direction", max_depth, 512, 1)
+        paths = PathSolver(problem_at(scene, lighting, points, max_depth=max_depth), 512)
         return paths.rows(every).mean[..., 0].astype(np.float64)
 
     totals = np.array([np.zeros((8, 24)), *(found(positive, 2 + count) for count in bounces)])

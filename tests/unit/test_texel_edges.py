@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import altered, build, bumpy_ball, diffuse, mesh
+from conftest import altered, build, bumpy_ball, diffuse, mesh, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.bits import above_horizon, pack, unpack
@@ -289,7 +289,7 @@ def bits_of(direct: DirectSolver) -> np.ndarray:
 def traced(scene: prt.Scene, n: int, every: int = 1) -> DirectSolver:
     points = vertex_points(scene)
     return DirectSolver(
-        scene.normalised, prt.CubemapLighting(n), chosen(points, np.arange(0, len(points), every))
+        problem_at(scene, prt.CubemapLighting(n), chosen(points, np.arange(0, len(points), every)))
     )
 
 
@@ -301,7 +301,7 @@ def chosen(points: Points, ids: np.ndarray) -> Points:
 
 def supersampled(direct: DirectSolver, strata: int) -> MeanCosine:
     fine = DirectSolver(
-        direct.scene, direct.lighting, direct.points, "texel", strata=strata, seed=direct.seed
+        problem_at(direct.scene, direct.lighting, direct.points, basis="texel"), strata, seed=direct.seed
     )
     ids = np.arange(len(direct.points))
     rows = [fine.rows(ids[a : a + fine.block_size]) for a in range(0, len(ids), fine.block_size)]
@@ -343,7 +343,7 @@ def test_the_order_of_vertices_and_blocks_does_not_matter(grey_scene, monkeypatc
     again, rays_again = fractional_visibility(direct, bits)
     assert same(whole, again) and rays == rays_again > 0
     order = np.random.default_rng(0).permutation(len(bits))
-    other = DirectSolver(direct.scene, direct.lighting, chosen(direct.points, order))
+    other = DirectSolver(problem_at(direct.scene, direct.lighting, chosen(direct.points, order)))
     assert same(fractional_visibility(other, bits_of(other))[0], whole.take(order))
 
 
@@ -394,7 +394,7 @@ def test_held_out_elements_tell_the_error(grey_scene):
     problem = Problem(
         grey_scene, direct.lighting, mesh_vertices(grey_scene), Diffuse(grey_scene.albedo), "texel", 2
     )
-    runs = [held_out_error(problem, transport, seed) for seed in (10, 11, 12)]
+    runs = [held_out_error(problem, transport, seed).report() for seed in (10, 11, 12)]
     found = np.mean([run["total"] for run in runs])
     width = np.sqrt(sum(run["standard_error"]["total"] ** 2 for run in runs)) / 3
     assert width < 0.15 * truth

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import COLOURS, build, still_life
+from conftest import COLOURS, build, few_held_out, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.column_sampling import (
@@ -15,12 +15,11 @@ from mi_sparse_prt.benchmark.column_sampling import (
 from mi_sparse_prt.benchmark.converged_reference import ReferenceEffort
 from mi_sparse_prt.benchmark.time_error import TimeErrorEffort, run_methods, time_against_error
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.profiling import Stopwatch
-from mi_sparse_prt.estimation import held_out
-from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.methods import huang2010
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
+from mi_sparse_prt.methods.huang2010 import Huang2010Options, huang2010_parts
 from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.spatial import SpatialSampling
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
@@ -54,12 +53,9 @@ def test_columns_are_those_of_the_nearest_dense_vertex(scene, lighting):
         from its own rows: a row that is zero everywhere but at a few directions gives these and no others.
     Result: as expected.
     """
-    points = vertex_points(scene)
-    sampler = DenseSampler(
-        scene, DirectSolver(scene.normalised, lighting, points), AngularGrid(lighting), Stopwatch()
-    )
+    sampler = DenseSampler(DirectSolver(problem_at(scene, lighting)), AngularGrid(lighting), Run())
     for mesh in scene.meshes:
-        sampler.choose(mesh, 0.25, 0.05, 0)
+        sampler.choose(mesh, SpatialSampling(0.25, radius=0.05))
     dense = sampler.dense()
     rows = np.zeros((len(dense.ids), lighting.n_directions), np.float32)
     for k, mesh in enumerate(scene.meshes):
@@ -113,18 +109,16 @@ def test_a_matrix_by_regional_columns(choice, scene, lighting):
 
 def test_the_papers_columns_are_the_default(grey_scene, small_lighting):
     """Expected: the same weights whether its choice is named or not, and others with another choice."""
-    points = vertex_points(grey_scene)
-    direct = DirectSolver(grey_scene.normalised, small_lighting, points)
+    direct = DirectSolver(problem_at(grey_scene, small_lighting))
 
-    def weights(**columns):
-        parts = huang2010.huang2010_parts(grey_scene, direct, None, 0, Stopwatch(), False, **columns)
-        return parts.direct.weights.toarray()
+    def weights(**options):
+        return huang2010_parts(direct, None, Run(), Huang2010Options(**options)).direct.weights.toarray()
 
     def first(dense, mean):
         return lambda near: np.full((len(near), 1), 40, np.int32)
 
     usual = weights()
-    np.testing.assert_array_equal(usual, weights(columns=huang2010.best_of_each_vertex))
+    np.testing.assert_array_equal(usual, weights(columns=Huang2010Options().directions_of))
     assert not np.array_equal(usual, weights(columns=first))
 
 
@@ -150,7 +144,7 @@ def test_time_against_error_from_end_to_end(monkeypatch, coloured_scene, small_l
         errors fall as 1 / sqrt(paths) within their standard errors; JSON as it is; a figure for all meshes and each.
     Result: as expected.
     """
-    monkeypatch.setattr(held_out, "SPP", 32)
+    few_held_out(monkeypatch, spp=32)
     scene, chosen = coloured_scene, ["k_means_columns", "gather", "auto 0.2"]
     report = time_against_error(scene, small_lighting, False, tmp_path, chosen, effort=QUICK)
     assert json.loads(json.dumps(report, allow_nan=False)) == report

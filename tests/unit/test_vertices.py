@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, bumpy_ball, diffuse, mesh, still_life
+from conftest import T, build, bumpy_ball, diffuse, mesh, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import sensor_points, vertex_points, vertex_rays
@@ -84,7 +84,7 @@ def test_border_vertices_on_a_fold_stay_on_their_surface(sides):
     upper = np.stack([right[:-1], index[1:], right[1:]], axis=-1).reshape(-1, 3)
     prism = mesh("prism", np.concatenate(rings), np.concatenate([lower, upper]), WHITE)
     scene = build(float("inf"), prism=prism)
-    direct = DirectSolver(scene.normalised, prt.CubemapLighting(8), vertex_points(scene))
+    direct = DirectSolver(problem_at(scene, prt.CubemapLighting(8)))
     points, texels = np.repeat(np.arange(3 * sides), 384), np.tile(np.arange(384), 3 * sides)
     irradiance = direct.elements(points, texels).reshape(3, sides, 384).sum(axis=2)
     assert (irradiance[1] > 0.5).all()
