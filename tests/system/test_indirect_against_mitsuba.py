@@ -279,7 +279,7 @@ def test_without_a_depth_limit(artefact):
     assert_unbiased(result)
     assert stats.kstest(result.row_z, "norm").pvalue > 1e-3
     solver = PathSolver(problem_at(scene, prt.CubemapLighting(2), sensor_points(scene)), 256)
-    mean = solver.rows(rows).mean[..., 1] * solver.lighting.solid_angles * scene.albedo[rows, 1, None]
+    mean = solver.rows(rows).mean[..., 0] * solver.lighting.solid_angles * scene.albedo[rows, :1]
     print(f"max_depth 5 has {mean.sum() / result.ours.sum():.1%} of the light")
     assert mean.sum() < 0.8 * result.ours.sum()
 

@@ -1,6 +1,7 @@
 """Visible areas of texels from traced edges: tables, areas of squares, analytic occluders, and supersampling."""
 
 from collections import Counter
+from dataclasses import replace
 from itertools import combinations
 
 import drjit as dr
@@ -300,9 +301,7 @@ def chosen(points: Points, ids: np.ndarray) -> Points:
 
 
 def supersampled(direct: DirectSolver, strata: int) -> MeanCosine:
-    fine = DirectSolver(
-        problem_at(direct.scene, direct.lighting, direct.points, basis="texel"), strata, seed=direct.seed
-    )
+    fine = DirectSolver(replace(direct.problem, basis="texel"), strata, direct.seed)
     ids = np.arange(len(direct.points))
     rows = [fine.rows(ids[a : a + fine.block_size]) for a in range(0, len(ids), fine.block_size)]
     return MeanCosine(np.concatenate(rows), direct.lighting)
@@ -343,7 +342,7 @@ def test_the_order_of_vertices_and_blocks_does_not_matter(grey_scene, monkeypatc
     again, rays_again = fractional_visibility(direct, bits)
     assert same(whole, again) and rays == rays_again > 0
     order = np.random.default_rng(0).permutation(len(bits))
-    other = DirectSolver(problem_at(direct.scene, direct.lighting, chosen(direct.points, order)))
+    other = DirectSolver(direct.problem.at(chosen(direct.points, order)))
     assert same(fractional_visibility(other, bits_of(other))[0], whole.take(order))
 
 
