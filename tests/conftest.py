@@ -230,10 +230,21 @@ def problem_at(
     return problem if points is None else problem.at(points)
 
 
+PIPELINE = importlib.import_module("mi_sparse_prt.precompute")  # the package's own is the function
+
+
 def few_held_out(monkeypatch: pytest.MonkeyPatch, **effort: int) -> None:
-    """Precomputations whose error is not asked for find it with less effort."""
-    pipeline = importlib.import_module("mi_sparse_prt.precompute")  # the package's own is the function
-    monkeypatch.setattr(pipeline, "held_out_error", partial(held_out_error, effort=Effort(**effort)))
+    """Precomputations find their error with another effort than all tests do."""
+    monkeypatch.setattr(PIPELINE, "held_out_error", partial(held_out_error, effort=Effort(**effort)))
+
+
+@pytest.fixture
+def usual_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As users have it: half of the time of all tests together would go into it."""
+    few_held_out(monkeypatch)
+
+
+PIPELINE.held_out_error = partial(held_out_error, effort=Effort(spp=64))
 
 
 def assert_same(a: LightTransport, b: LightTransport) -> None:
