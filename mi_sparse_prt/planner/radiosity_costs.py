@@ -18,7 +18,7 @@ from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.reconstruction.node_placement import NODES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.first_bounce import FEW_ROWS, MIXED, MOST, ROWS
+from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.touching_surfaces import contacts
 
@@ -130,13 +130,13 @@ class GatherCosts:
         half, whole = (float(np.searchsorted(-x, -(seen**2))) for x in self.spectra)
         doublings = min(3 + math.log2(seen / FINE), 4.0)
         grown = whole * max(whole / max(half, 1.0), 1.0) ** doublings * (seen / tolerance) ** 0.4
-        return min(grown, self.vertices, self.directions, MOST)
+        return min(grown, self.vertices, self.directions, USUAL.most)
 
     def seconds(self, rays: int, tolerance: float) -> float:
         """Predicted time of rays and interreflections: the terms are the steps of ``solvers.first_bounce``."""
         nodes, rank, entries = min(self.vertices, NODES), self.rank(tolerance), rays * self.entries
-        rows = max(FEW_ROWS, ROWS * rank)
-        expanded = self.vertices * (self.directions + MIXED * rank)
+        rows = max(USUAL.few_rows, USUAL.rows * rank)
+        expanded = self.vertices * (self.directions + USUAL.mixed * rank)
         squares = SQUARES * nodes * rank**2 * self.channels
         dense = EXPANSION * expanded + rows * rank * self.directions * self.channels + squares
         bounces = nodes * entries * rank * (1 + LATER * self.channels)

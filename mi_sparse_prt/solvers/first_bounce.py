@@ -21,18 +21,57 @@ from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
 from mi_sparse_prt.operators.operator import Operator
 
-DRAWS = 3  # of up to 32 combinations of columns each, that join the basis together
-MIXED = 24  # columns in a combination
-SUMS = 1 << 13  # of rows; a power of two
-PROJECTIONS = 24  # that tell leverage within 30%
-ROWS = 4  # times the rank
-FEW_ROWS = 1024  # of which all are taken
-BASES = 0.75  # of the squared tolerance: the last of the energy takes a random basis many vectors
-MOST = 1024  # vectors in a basis, about: time grows as their square, and what is left is mostly noise
 PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RandomBasis:
+    """How the random basis is drawn and used.
+
+    Attributes
+    ----------
+    draws : int
+        Of up to 32 combinations of columns each, that join the basis together.
+    mixed : int
+        Columns in a combination.
+    sums : int
+        Random sums of rows by which lengths and angles are known; a power of two.
+    projections : int
+        That tell leverage: 24 tell it within 30%.
+    rows : int
+        Rows for least squares, times the rank (4: the squared error is 4/3 of the least).
+    few_rows : int
+        At least so many.
+    share : float
+        Of the squared tolerance: the last of the energy takes a random basis many vectors.
+    most : int
+        Vectors, about: time grows as their square, and what is left is mostly noise.
+    """
+
+    draws: int = 3
+    mixed: int = 24
+    sums: int = 1 << 13
+    projections: int = 24
+    rows: int = 4
+    few_rows: int = 1024
+    share: float = 0.75
+    most: int = 1024
+
+    def row_count(self, rank: int, n: int) -> int:
+        """How many of n rows are taken."""
+        count = max(self.few_rows, self.rows * rank)
+        return n if 2 * count > n else count
+
+    def amplification(self, rank: int, n: int, sums: int) -> float:
+        """Of the squared error: what least squares make worse of it, from sums of rows and from some of the rows."""
+        rows = self.row_count(rank, n)
+        return (1.0 if rows == n else rows / (rows - rank)) / (1.0 if sums == n else 1 - rank / sums)
+
+
+USUAL = RandomBasis()
 
 
 @dataclass(frozen=True)
@@ -61,6 +100,7 @@ def first_bounce(
     keys: NDArray[np.uint64],
     tolerance: float,
     seed: int,
+    options: RandomBasis = USUAL,
 ) -> FirstBounce:
     """G rho D for all channels.
 
@@ -76,6 +116,7 @@ def first_bounce(
     tolerance : float
         Relative L2 error; it is larger where that would take a rank far above 1000.
     seed : int
+    options : RandomBasis
 
     Returns
     -------
@@ -83,9 +124,9 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrix, albedo, direct, hashes, rng, tolerance)
-    count = _row_count(turn.shape[1], len(keys))
-    rows, probability = _chosen_rows(_leverage(columns, turn, rng), hashes, count)
+    columns, turn, missed = _basis(matrix, albedo, direct, hashes, rng, tolerance, options)
+    count = options.row_count(turn.shape[1], len(keys))
+    rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = columns[rows].astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
@@ -100,6 +141,7 @@ def _basis(
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
+    options: RandomBasis,
 ) -> tuple[Floats, Doubles, float]:
     """Combinations Y (n, m) of the columns of all channels; turn (m, r), which makes them a basis; what that misses.
 
@@ -107,12 +149,12 @@ def _basis(
     before it joins (Halko et al. 2011, 4.3). Gram and Schmidt see random sums of rows only, by which lengths and
     angles change little (Balabanov and Grigori 2022).
     """
-    shorten = _sums(hashes)
+    shorten = _sums(hashes, options.sums)
     blocks: list[Floats] = []  # [row, combination]
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
     while True:
-        block = _combinations(matrix, albedo, direct, rng)
+        block = _combinations(matrix, albedo, direct, options, rng)
         new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
@@ -120,10 +162,11 @@ def _basis(
         rest = products[-1] - known.T @ known
         energies.append(np.trace(products[-1]))
         energy = max(float(np.mean(energies)), 1e-30)
-        missed = max(float(np.trace(rest)), 0) / energy * _amplification(len(known), len(block), len(new))
+        missed = max(float(np.trace(rest)), 0) / energy
+        missed *= options.amplification(len(known), len(block), len(new))
         squares, vectors = np.linalg.eigh(rest)
         kept = squares > (PRECISION / 2) ** 2 * energy
-        if missed <= BASES * tolerance**2 or not kept.any() or len(known) >= MOST:
+        if missed <= options.share * tolerance**2 or not kept.any() or len(known) >= options.most:
             return np.hstack([*blocks, block[:, :0]]), turn, missed
         steps = vectors[:, kept] / np.sqrt(squares[kept])
         turn = np.block([[turn, -turn @ (known @ steps)], [np.zeros((len(steps), turn.shape[1])), steps]])
@@ -131,41 +174,34 @@ def _basis(
         short.append(new)
 
 
-def _sums(hashes: NDArray[np.uint64]) -> scipy.sparse.csr_array | None:
-    """A matrix (SUMS, n) that adds up rows at random, with signs; None where they are few enough as they are."""
+def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | None:
+    """A matrix (count, n) that adds up rows at random, with signs; None where they are few enough as they are."""
     n = len(hashes)
-    if n <= SUMS:
+    if n <= count:
         return None
     signs = 1 - 2 * (hashes >> np.uint64(63)).astype(np.float32)
-    entries = signs, ((hashes & np.uint64(SUMS - 1)).astype(np.int64), np.arange(n))
-    return scipy.sparse.csr_array(entries, shape=(SUMS, n))
+    entries = signs, ((hashes & np.uint64(count - 1)).astype(np.int64), np.arange(n))
+    return scipy.sparse.csr_array(entries, shape=(count, n))
 
 
 def _combinations(
-    matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator, rng: np.random.Generator
+    matrix: scipy.sparse.csr_array,
+    albedo: Floats,
+    direct: Operator,
+    options: RandomBasis,
+    rng: np.random.Generator,
 ) -> Floats:
     """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations)."""
-    found, draws = [], max(1, DRAWS // len(albedo))
+    found, draws = [], max(1, options.draws // len(albedo))
     for rho in albedo:
-        mixed = np.hstack([random_combinations(direct, MIXED, rng) for _ in range(draws)])
+        mixed = np.hstack([random_combinations(direct, options.mixed, rng) for _ in range(draws)])
         found.append(multiply_scaled(matrix, rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
 
 
-def _amplification(rank: int, n: int, sums: int) -> float:
-    """Of the squared error: what least squares make worse of it, from sums of rows and from some of the rows."""
-    rows = _row_count(rank, n)
-    return (1.0 if rows == n else rows / (rows - rank)) / (1.0 if sums == n else 1 - rank / sums)
-
-
-def _row_count(rank: int, n: int) -> int:
-    count = max(FEW_ROWS, ROWS * rank)
-    return n if 2 * count > n else count
-
-
-def _leverage(columns: Floats, turn: Doubles, rng: np.random.Generator) -> Doubles:
+def _leverage(columns: Floats, turn: Doubles, projections: int, rng: np.random.Generator) -> Doubles:
     """Squared norms (n,) of the rows of the basis, about: from random projections."""
-    projection = turn @ rng.standard_normal((turn.shape[1], PROJECTIONS))
+    projection = turn @ rng.standard_normal((turn.shape[1], projections))
     return np.square(columns @ projection.astype(np.float32)).sum(axis=1, dtype=np.float64)
 
 

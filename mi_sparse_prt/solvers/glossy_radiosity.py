@@ -27,7 +27,7 @@ from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
-from mi_sparse_prt.solvers.first_bounce import MIXED
+from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import BEHIND, LANES, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
@@ -138,7 +138,7 @@ class GatherRays:
         shape = 2 * len(some), len(points)
         place = row[self.point[own]] + half * len(some), self.seen[own]
         halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
-        light = random_combinations(direct.visibility, MIXED, np.random.default_rng(seed))
+        light = random_combinations(direct.visibility, USUAL.mixed, np.random.default_rng(seed))
         return relative_noise(*np.split(halves @ light, 2))
 
 

@@ -28,14 +28,13 @@ from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.first_bounce import FirstBounce, all_but_least, first_bounce
+from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 
 COLUMNS = 256  # of a dense matrix that G is applied to at a time
-LATER = 0.25  # of the squared tolerance: what a later bounce may leave out of the light that it starts from
 NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
 LONGEST = 1024  # bounces after which light is taken not to end
 
@@ -58,6 +57,22 @@ class Gathered(LowRank):
     bounces: int
 
 
+@dataclass(frozen=True)
+class LowRankOptions:
+    """How indirect light for all texels is factored.
+
+    Attributes
+    ----------
+    basis : RandomBasis
+        Of the first bounce.
+    later : float
+        Of the squared tolerance: what a later bounce may leave out of the light that it starts from.
+    """
+
+    basis: RandomBasis = RandomBasis()
+    later: float = 0.25
+
+
 class FiniteElements:
     """Interreflections between vertices, or whatever else rows of light stand for.
 
@@ -76,6 +91,10 @@ class FiniteElements:
         As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
         nothing are left out.
     seed : int
+
+    Attributes
+    ----------
+    options : LowRankOptions
     """
 
     def __init__(
@@ -90,7 +109,7 @@ class FiniteElements:
     ) -> None:
         self.matrix, self._albedo, self._keys, self.nodes = matrix, albedo, keys, nodes
         self.contacts, self.max_depth, self.seed = contacts, max_depth, seed
-        self.channels = len(albedo)
+        self.channels, self.options = len(albedo), LowRankOptions()
 
     def apply(self, columns: Floats) -> Floats:
         """Indirect light under a few lights, without approximation.
@@ -189,8 +208,10 @@ class FiniteElements:
             right = np.zeros((0, direct.shape[1]), np.float32)
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         keys = self._keys[self.nodes.ids]
-        first = first_bounce(self.matrix, self._albedo, direct, keys, tolerance, self.seed)
-        totals = self._all_bounces(first, count, LATER * tolerance**2)
+        first = first_bounce(
+            self.matrix, self._albedo, direct, keys, tolerance, self.seed, self.options.basis
+        )
+        totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.spread(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
 
@@ -283,6 +304,7 @@ class RadiositySolver(FiniteElements):
     seed : int
     nodes : Nodes, optional
         The vertices that gather light, others interpolate theirs; all if not given.
+    options : LowRankOptions, optional
 
     Attributes
     ----------
@@ -309,6 +331,7 @@ class RadiositySolver(FiniteElements):
         rays_per_vertex: int = 256,
         seed: int = 0,
         nodes: Nodes | None = None,
+        options: LowRankOptions | None = None,
     ) -> None:
         scene, points, emission = problem.scene, problem.points, problem.emission
         _check_diffuse(scene)
@@ -322,6 +345,7 @@ class RadiositySolver(FiniteElements):
             problem.max_depth,
             seed,
         )
+        self.options = options or self.options
         self.rays = len(nodes) * rays_per_vertex
         self._scene, self._rays_per_vertex = scene, rays_per_vertex
 
@@ -339,7 +363,7 @@ class RadiositySolver(FiniteElements):
         matrix = gather_matrix(self._scene, points, self._rays_per_vertex, self.seed)
         self.rays += len(points) * self._rays_per_vertex
         lit = self._lit(direct)
-        first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed)
+        first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
         before = self.indirect(direct, tolerance)  # what vertices receive, one bounce before
         again = [
             multiply_scaled(matrix, rho[None], x)[0] for rho, x in zip(self._albedo, before.left, strict=True)

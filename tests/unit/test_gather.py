@@ -23,15 +23,16 @@ from mi_sparse_prt.solvers import first_bounce as bounce_module
 from mi_sparse_prt.solvers import form_factors as matrix_module
 from mi_sparse_prt.solvers import radiosity as gather_module
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.first_bounce import RandomBasis
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.radiosity import LowRankOptions, RadiositySolver
 
 WHITE = diffuse(1, 1, 1)
 ROOM = {"type": "cube", "flip_normals": True}
 
 
 def solver(
-    scene: Scene, n: int = 2, rays: int = 64, max_depth: int = 5, **parameters: int
+    scene: Scene, n: int = 2, rays: int = 64, max_depth: int = 5, **parameters: object
 ) -> RadiositySolver:
     return RadiositySolver(problem_at(scene, prt.CubemapLighting(n), max_depth=max_depth), rays, **parameters)
 
@@ -305,10 +306,14 @@ def test_parts_of_the_result_agree(coloured_scene):
     assert result.nbytes == 4 * sum(rank * (n + 96) for rank in result.ranks)
 
 
-def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
+def drawn_by(**basis: float) -> LowRankOptions:
+    return LowRankOptions(RandomBasis(**basis))
+
+
+def test_a_basis_from_some_of_the_directions(coloured_scene):
     """A quarter of the texels, others for each block: the estimate is that of all of them."""
-    monkeypatch.setattr(bounce_module, "MIXED", 4)
-    gather, direct = solver(coloured_scene, 8, max_depth=3), visibility(coloured_scene, 8)
+    gather = solver(coloured_scene, 8, max_depth=3, options=drawn_by(mixed=4))
+    direct = visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.1)
     known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
     missing = relative(found.columns(np.arange(384)), known)
@@ -316,10 +321,10 @@ def test_a_basis_from_some_of_the_directions(coloured_scene, monkeypatch):
     assert missing == pytest.approx(found.left_out, rel=0.25)
 
 
-def test_a_basis_has_an_end(coloured_scene, monkeypatch):
+def test_a_basis_has_an_end(coloured_scene):
     """More vectors than the most are not looked for: it is said how much is missing, and that much is."""
-    monkeypatch.setattr(bounce_module, "MOST", 16)
-    gather, direct = solver(coloured_scene, 8, max_depth=3), visibility(coloured_scene, 8)
+    gather = solver(coloured_scene, 8, max_depth=3, options=drawn_by(most=16))
+    direct = visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.001)
     known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
     assert max(found.ranks) <= 16 + 96  # combinations join by blocks
@@ -365,19 +370,18 @@ def test_any_part_will_do(coloured_scene):
     assert relative(gather.rows(SomePart(direct), some), gather.rows(direct, some)) < 1e-5
 
 
-def test_least_squares_from_some_rows(monkeypatch):
+def test_least_squares_from_some_rows():
     """A basis made from sums of rows, and coefficients from a fifth of the rows, do not need them all.
 
     Expected: the error that is said, within a third (it is measured on 96 combinations of a few columns each).
     """
     scene = build(0.15, **still_life(COLOURS))
-    gather, direct = solver(scene, 4, max_depth=3), visibility(scene)
-    monkeypatch.setattr(bounce_module, "FEW_ROWS", 16)
-    monkeypatch.setattr(bounce_module, "SUMS", 512)
+    basis = RandomBasis(few_rows=16, sums=512)
+    gather, direct = solver(scene, 4, max_depth=3, options=LowRankOptions(basis)), visibility(scene)
     found = gather.indirect(direct, tolerance=0.1)
     known = gather.apply(gather.contacts.lit(direct).columns(np.arange(96))[..., 0])
     assert scene.n_vertices > 1500
-    assert bounce_module.ROWS * sum(found.ranks) < scene.n_vertices / 2
+    assert basis.rows * sum(found.ranks) < scene.n_vertices / 2
     assert relative(found.columns(np.arange(96)), known) == pytest.approx(found.left_out, rel=0.33)
 
 
