@@ -24,7 +24,7 @@ from mi_sparse_prt.methods.lamps import gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.candidates import Ladder, Ranking, ladder
+from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
@@ -197,14 +197,14 @@ class _Attempts:
     def _direct_light(self) -> list[MethodResult]:
         """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
         proposals, problem = self._proposals, self._problem
-        if isinstance(proposals, Ladder) or (how := proposals.uncertain) is None:
+        if isinstance(proposals, RefinementSchedule) or (how := proposals.uncertain) is None:
             return []
         parts = self._execution.direct_light(how)
         with self._run.clock.phase("held_out"):
             only = replace(problem, max_depth=2)
             stream = random_stream(self._run.seed, DECISION, 0)
             found = held_out_error(only, matrix_of(problem, parts), stream)
-        proposals.judged(how, found.total)
+        proposals.choose_again(how, found.total)
         return [parts]
 
     def _evaluated(self, before: list[MethodResult]) -> MethodResult:
@@ -296,15 +296,15 @@ def _skipped(scene: Scene, reason: str | None) -> list[str]:
 
 def _proposals(
     direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
-) -> Ladder | Ranking:
+) -> RefinementSchedule | CandidatePlans:
     """The plans to try, measured and ranked where the method leaves them open."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
         settings = replace(settings, spp=None, indirect_resolution=None)
     elif settings.method != "auto" or settings.view_dependent or settings.measurement != "vertices":
-        return ladder(settings)
+        return refinement_schedule(settings)
     with clock.phase("plan"):
         costs = measure(direct, settings, indirect)
-    return Ranking(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
+    return CandidatePlans(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
 
 
 def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:

@@ -23,7 +23,7 @@ Values = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Halves:
-    """A part of white transport at some elements, twice, independently of each other.
+    """A part of unit-albedo transport at some elements, twice, independently of each other.
 
     Attributes
     ----------
@@ -130,12 +130,12 @@ class PilotElements:
         x, y = self._albedo * (self.direct.values + (self.indirect.values if self.indirect else 0))
         return ((elements - x) * (elements - y)).sum(axis=2)
 
-    def error_of(self, part: Halves, white: Values) -> NDArray[np.float64]:
-        """What a part's white transport (k, t, channels) adds to the squared errors (k, t), without bias."""
-        return self._squares(*(white - part.values))
+    def error_of(self, part: Halves, unit_albedo: Values) -> NDArray[np.float64]:
+        """What a part's unit-albedo transport (k, t, channels) adds to the squared errors (k, t), without bias."""
+        return self._squares(*(unit_albedo - part.values))
 
     def weighted(self, squares: Values) -> NDArray[np.float64]:
-        """Squares (k, t, channels) of white transport as those of T, (k, t), summed over channels."""
+        """Squares (k, t, channels) of unit-albedo transport as those of T, (k, t), summed over channels."""
         return (self._albedo**2 * squares).sum(axis=2)
 
     def _squares(self, x: Values, y: Values) -> NDArray[np.float64]:

@@ -193,7 +193,7 @@ def _fitted(
 def whole_rows(
     visibility: Visibility, interreflected: Upsampled | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Whole rows of white transport: dense vertices, from which L1 minimization has its equations.
+    """Whole rows of unit-albedo transport: dense vertices, from which L1 minimization has its equations.
 
     Parameters
     ----------
@@ -241,17 +241,17 @@ def _sampled(
     directions: NDArray[np.int32],
     clock: Stopwatch,
 ) -> NDArray[np.float32]:
-    """White transport (n, s, channels) of vertices at their directions; 0 where there are fewer."""
+    """Unit-albedo transport (n, s, channels) of vertices at their directions; 0 where there are fewer."""
     present = directions >= 0
     vertices, texels = np.repeat(ids, present.sum(axis=1)), directions[present]
     with clock.phase("sparse_rays"):
-        white = direct.elements(vertices, texels)[:, None]
+        unit_albedo = direct.elements(vertices, texels)[:, None]
     if indirect is not None:
         with clock.phase("sparse_paths"):
             mean = indirect.elements(vertices, texels).mean
-        white = white + mean * direct.lighting.solid_angles[texels][:, None]
-    sampled = np.zeros((*directions.shape, white.shape[1]), np.float32)
-    sampled[present] = white
+        unit_albedo = unit_albedo + mean * direct.lighting.solid_angles[texels][:, None]
+    sampled = np.zeros((*directions.shape, unit_albedo.shape[1]), np.float32)
+    sampled[present] = unit_albedo
     return sampled
 
 

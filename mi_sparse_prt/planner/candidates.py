@@ -23,10 +23,10 @@ from mi_sparse_prt.planner.choice import (
 from mi_sparse_prt.planner.direct_costs import DirectCost
 
 ATTEMPTS = 4
-PATIENCE = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
+TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
 
 
-class Ladder:
+class RefinementSchedule:
     """Plans in turn.
 
     Parameters
@@ -40,7 +40,7 @@ class Ladder:
     seconds : float or None
         What it is predicted to take in all.
     too_long : None
-        See ``Ranking``.
+        See ``CandidatePlans``.
     """
 
     seconds: float | None = None
@@ -61,8 +61,8 @@ class Ladder:
         return []
 
 
-class Ranking:
-    """Plans by what was measured; attributes and methods of the same name are those of ``Ladder``.
+class CandidatePlans:
+    """Plans by what was measured; attributes and methods of the same name are those of ``RefinementSchedule``.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Ranking:
         settings = self._settings
         self._costs = costs
         self._plans = predictions(costs, settings.target_error or TARGET, settings.spp)
-        # errors of paths are predicted too well for a trial to turn out better
+        # errors of paths are predicted too well for a first attempt to turn out better
         begin = choose_first if settings.method == "auto" else choose
         self._best = begin(self._plans, settings.target_error)
         self._tried = [self._best]
@@ -105,7 +105,7 @@ class Ranking:
         """Direct light to find and to judge before anything else, as the choice depends on it."""
         return uncertain(self._costs, self._settings.target_error, self._settings.spp)
 
-    def judged(self, direct: str, error: float) -> None:
+    def choose_again(self, direct: str, error: float) -> None:
         """Choose again, now that this direct light has been found and its error, relative to all of it, is known."""
         costs = self._costs
         found = DirectCost(0.0, costs.direct_share * error)
@@ -122,11 +122,11 @@ class Ranking:
             return False
         plans = finer(self._costs, self._best, error, target, settings.spp)
         self._costs = learned(self._costs, self._best.plan, error)
-        patience = PATIENCE * self._tried[0].seconds
+        budget = TIME_BUDGET * self._tried[0].seconds
         found = choose(plans, target) if plans else None
-        if found is not None and found.seconds > patience:
+        if found is not None and found.seconds > budget:
             self.too_long = found if found.error <= target else None
-            found = better(plans, error, patience)
+            found = better(plans, error, budget)
         if found is None:
             return False
         self._best = found
@@ -141,10 +141,12 @@ class Ranking:
         return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
 
 
-def ladder(settings: Settings) -> Ladder:
+def refinement_schedule(settings: Settings) -> RefinementSchedule:
     """The plan of a method; with a target error, from the coarsest of its plans on."""
     if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
-        return Ladder([settings.with_shares(plan) for plan in EFFORTS["gather"]])
+        return RefinementSchedule([settings.with_shares(plan) for plan in EFFORTS["gather"]])
     if settings.target_error is None or isinstance(settings.method, Plan):
-        return Ladder([settings.plan])
-    return Ladder([settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))])
+        return RefinementSchedule([settings.plan])
+    return RefinementSchedule(
+        [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
+    )

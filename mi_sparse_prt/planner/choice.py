@@ -21,10 +21,12 @@ TARGET = 0.02  # where none is given
 MARGIN = 0.95  # of a target is aimed at by paths, whose number is free
 SPREAD = 0.1  # standard deviation of predicted errors from those found, relative; of 41 plans on three scenes
 SAFE = 1.1  # by what factor a plan for after a miss is below the target: that miss tells how far off predictions are
-DOUBT = 2.0  # by what factor predictions may be off where they are worst
-JUDGED = 0.07  # relative standard error of what a round of held-out elements finds; a typical one
-WORTHWHILE = 0.9  # of an error is better
-TRIAL = 0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first
+WORST_FACTOR = 2.0  # by what factor predictions may be off where they are worst
+STANDARD_ERROR = 0.07  # relative standard error of what a round of held-out elements finds; a typical one
+MINIMUM_GAIN = 0.9  # of an error is better
+FIRST_SHARE = (
+    0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first
+)
 
 _NORMAL = ndtri((np.arange(32) + 0.5) / 32)  # as likely each
 
@@ -116,7 +118,7 @@ def _miss(error: float, target: float) -> float:
 def _rounds(error: float, target: float) -> float:
     """Of held-out elements, as many as tell whether a target is met: two standard errors apart. An expected value."""
     apart = np.abs(np.log(max(error, 1e-150) / target) + SPREAD * _NORMAL)
-    return float(np.clip((2 * JUDGED / np.maximum(apart, 1e-9)) ** 2, 1.0, 1 / ROUND).mean())
+    return float(np.clip((2 * STANDARD_ERROR / np.maximum(apart, 1e-9)) ** 2, 1.0, 1 / ROUND).mean())
 
 
 def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[_Priced]:
@@ -153,9 +155,9 @@ def choose_first(plans: list[Predicted], target: float | None) -> Predicted:
     best = choose(plans, target)
     if target is None:
         return best
-    spare = [(p, TRIAL * best.seconds / p.seconds) for p in plans]
-    trials = [p for p, factor in spare if factor >= 1 and p.error <= DOUBT * target * math.sqrt(factor)]
-    return min(trials, key=lambda p: _if_it_met(target, p)) if trials else best
+    spare = [(p, FIRST_SHARE * best.seconds / p.seconds) for p in plans]
+    first = [p for p, factor in spare if factor >= 1 and p.error <= WORST_FACTOR * target * math.sqrt(factor)]
+    return min(first, key=lambda p: _if_it_met(target, p)) if first else best
 
 
 def _if_it_met(target: float, p: Predicted) -> float:
@@ -175,7 +177,7 @@ def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str
             choose(
                 predictions(_with_error_times(factor, costs, name), target or TARGET, spp), target
             ).plan.direct
-            for factor in (1 / DOUBT, DOUBT)
+            for factor in (1 / WORST_FACTOR, WORST_FACTOR)
         }
         if name in choices and len(choices) > 1:
             return name
@@ -213,7 +215,7 @@ def learned(costs: Costs, plan: Plan, error: float) -> Costs:
 
 def better(plans: list[Predicted], error: float, seconds: float) -> Predicted | None:
     """The quickest plan that is clearly more exact than an error, and takes no longer than some seconds."""
-    good = [p for p in plans if p.error <= WORTHWHILE * error and p.seconds <= seconds]
+    good = [p for p in plans if p.error <= MINIMUM_GAIN * error and p.seconds <= seconds]
     return min(good, key=lambda p: p.seconds, default=None)
 
 

@@ -127,7 +127,7 @@ def _seconds_per_ray(direct: DirectSolver, ids: NDArray[np.int64], asked: Bits) 
 
 
 def _energy(direct: DirectSolver, ids: NDArray[np.int64], bits: Bits) -> NDArray[np.float64]:
-    """Squared norms (n,) of white direct light where bits (n, words) are set."""
+    """Squared norms (n,) of unit-albedo direct light where bits (n, words) are set."""
     lighting, total = direct.lighting, np.zeros(len(ids))
     for a in range(0, len(ids), PATCH):
         part = slice(a, a + PATCH)

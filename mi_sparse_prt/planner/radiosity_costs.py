@@ -193,7 +193,7 @@ def gather_costs(
 
 
 def _typical(held: PilotElements, squares: NDArray[np.float64]) -> float:
-    """Median, over groups of vertices, of what squares (k, t, channels) of white transport are relative to the matrix.
+    """Median, over groups of vertices, of squares (k, t, channels) of unit-albedo transport relative to the matrix.
 
     Interpolation errs much at few places. Where one of these is among the vertices, the mean says that no number of
     rays is enough, and a plan of hours follows. A plan that turns out to be not good enough costs seconds.
@@ -240,7 +240,7 @@ class _Pilot:
         return gather_matrix(self._scene, self._direct.points, count, seed, self._vertices)
 
     def light(self, rays: scipy.sparse.csr_array, texels: NDArray[np.integer]) -> NDArray[np.float64]:
-        """The first bounce (k, t, channels) of white transport at t texels (k, t) of each vertex."""
+        """The first bounce (k, t, channels) of unit-albedo transport at t texels (k, t) of each vertex."""
         row = np.repeat(np.arange(len(texels)), np.diff(rays.indptr))
         asked = texels[row]  # [entry, texel]
         vertices = np.repeat(rays.indices, asked.shape[1])

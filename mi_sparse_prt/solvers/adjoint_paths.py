@@ -70,7 +70,7 @@ class AdjointSolver:
         return min(PATHS, self.lighting.resolution**2)
 
     def rows(self, point_ids: NDArray[np.integer], seed: int | None = None) -> Estimate:
-        """White indirect transport per solid angle of whole rows: the elements that ``PathSolver.rows`` estimates.
+        """Unit-albedo indirect transport per solid angle of whole rows: the elements of ``PathSolver.rows``.
 
         Parameters
         ----------

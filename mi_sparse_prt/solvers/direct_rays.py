@@ -85,7 +85,7 @@ class DirectSolver:
     def elements(
         self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
     ) -> NDArray[np.float32]:
-        """White direct transport (the T of albedo 1) of listed elements.
+        """Unit-albedo direct transport (the T of albedo 1) of listed elements.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Interreflection among glossy surfaces by finite elements: terms of BRDFs are elements like vertices' white light.
+"""Interreflection among glossy surfaces by finite elements: terms of BRDFs are elements as vertices are.
 
 Light that leaves vertex y towards w_o is ``rho_y B_y + sum_l g_l(w_o) B_yl``: a diffuse part and the coefficients B_yl
 that incident factors f_l have found ([HR10] eq. 2-3, [Leh07] 2.5). What rays from x find of it, weighted by 1 (white
@@ -83,8 +83,10 @@ class GlossyGather(FiniteElements):
     def _count_for(self, direct: Operator) -> int:
         """By the direct light of white surfaces: that of terms is dear, and joins with the first bounce."""
         assert isinstance(direct, FactoredVisibility)
-        white = direct.visibility.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0]
-        return self.bounces(np.concatenate([white, np.zeros(direct.shape[0] - len(white), np.float32)]))
+        unit_albedo = direct.visibility.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0]
+        return self.bounces(
+            np.concatenate([unit_albedo, np.zeros(direct.shape[0] - len(unit_albedo), np.float32)])
+        )
 
     def bounces(self, even: Floats) -> int:
         """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
@@ -109,7 +111,7 @@ class GatherRays:
     number : (m,) int64
         Of a ray among those of its vertex, side by side.
     into : (m, 1 + K) float32
-        Weights in white light and in the terms of ``point``, times the number of rays.
+        Weights in unit-albedo light and in the terms of ``point``, times the number of rays.
     out : (m, channels * K) float32
         g_k of ``seen`` towards the ray's origin.
     per_vertex : int
@@ -124,7 +126,7 @@ class GatherRays:
     per_vertex: int
 
     def noise(self, direct: FactoredVisibility, albedo: Floats, points: Points, seed: int) -> float:
-        """Relative L2 of what their randomness leaves in the first bounce of white light.
+        """Relative L2 of what their randomness leaves in the first bounce of unit-albedo light.
 
         From how far two halves of them differ, at some vertices and under random sums of columns.
         ``albedo`` is that of one channel, (n_v,).
@@ -178,7 +180,7 @@ def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: 
 
 
 def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
-    """G (n, n) of one channel, over white light of all vertices and terms of the glossy ones."""
+    """G (n, n) of one channel, over unit-albedo light of all vertices and terms of the glossy ones."""
     n, terms = len(direct.material), direct.terms
     number = np.full(n, -1)  # of a vertex among the glossy ones
     number[direct.glossy] = np.arange(len(direct.glossy))
@@ -204,7 +206,7 @@ def _fill(
     columns: NDArray[np.int32],
     values: Floats,
 ) -> None:
-    """Rows of each point in turn: white light, then its terms; entries of a ray: white light, then terms."""
+    """Rows of each point in turn: unit-albedo light, then its terms; entries of a ray likewise."""
     n, terms = len(number), out.shape[1]
     for i in numba.prange(n):
         for row in range(1 + terms if number[i] >= 0 else 1):

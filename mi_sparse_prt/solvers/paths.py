@@ -88,7 +88,7 @@ class PathSolver:
         texel_ids: NDArray[np.integer],
         seed: int | None = None,
     ) -> Estimate:
-        """White indirect transport per solid angle (the indirect T of albedo 1, divided by d_omega) of listed elements.
+        """Unit-albedo indirect transport of listed elements per solid angle: the T of albedo 1, divided by d_omega.
 
         Parameters
         ----------

@@ -2,7 +2,7 @@
 
 Diffuse light is known at the vertices and interpolated on the triangles between. One bounce is then a sparse matrix G:
 its row i is the mean over cosine-distributed rays from vertex i of what they find at their other end. The indirect part
-of white transport is the Neumann series X = G rho D + G rho G rho D + ..., D the direct part and rho the albedo.
+of unit-albedo transport is the Neumann series X = G rho D + G rho G rho D + ..., D the direct part and rho the albedo.
 
 Indirect light is smooth. Where a scene has more vertices than it needs, G has rows at some of them only, the nodes, and
 others take their light from these: X = W (G rho D + G rho W G rho D + ...). D and rho stay those of all vertices.
@@ -117,12 +117,12 @@ class FiniteElements:
         Parameters
         ----------
         columns : (n_v, k) float32
-            White direct transport of each light, without what ``contacts`` leaves out.
+            Unit-albedo direct transport of each light, without what ``contacts`` leaves out.
 
         Returns
         -------
         (n_v, k, channels) float32
-            White indirect transport.
+            Unit-albedo indirect transport.
         """
         result = np.zeros((*columns.shape, self.channels), np.float32)
         count = self.bounces(columns.sum(axis=1))
@@ -133,7 +133,7 @@ class FiniteElements:
             for _ in range(count - 1):
                 light = self._reflected(light)
                 totals = [total + x for total, x in zip(totals, light, strict=True)]
-            result[:, part] = np.stack([self.nodes.spread(total) for total in totals], axis=-1)
+            result[:, part] = np.stack([self.nodes.interpolate(total) for total in totals], axis=-1)
         return result
 
     def apply_coloured(self, columns: Floats) -> Floats:
@@ -145,9 +145,9 @@ class FiniteElements:
             light = multiply_scaled(self.matrix, rho, np.ascontiguousarray(columns[..., c]))[0]
             total = light.copy()
             for _ in range(count - 1):
-                light = multiply_scaled(self.matrix, rho, self.nodes.spread(light))[0]
+                light = multiply_scaled(self.matrix, rho, self.nodes.interpolate(light))[0]
                 total += light
-            result[..., c] = self.nodes.spread(total)
+            result[..., c] = self.nodes.interpolate(total)
         return result
 
     def rows(self, direct: Operator, ids: NDArray[np.integer]) -> Floats:
@@ -162,7 +162,7 @@ class FiniteElements:
         Returns
         -------
         (k, n_directions, channels) float32
-            White indirect transport.
+            Unit-albedo indirect transport.
         """
         direct = self._lit(direct)
         count = self._count_for(direct)
@@ -179,7 +179,9 @@ class FiniteElements:
         weights[ids, np.arange(len(ids))] = 1
         total = np.zeros_like(weights)
         for _ in range(count):
-            weights = rho[:, None] * multiply_sparse(self._transposed, self.nodes.collect(weights))
+            weights = rho[:, None] * multiply_sparse(
+                self._transposed, self.nodes.interpolate_adjoint(weights)
+            )
             total += weights
         return total
 
@@ -212,7 +214,7 @@ class FiniteElements:
             self.matrix, self._albedo, direct, keys, tolerance, self.seed, self.options.basis
         )
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
-        spread = tuple(self.nodes.spread(total) for total in totals)
+        spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
 
     def _all_bounces(self, first: FirstBounce, count: int, expendable: float) -> list[Floats]:
@@ -288,7 +290,7 @@ class FiniteElements:
     def _reflected(self, light: list[Floats]) -> list[Floats]:
         """One bounce: G rho W x for arrays x (n_nodes, any), one per channel."""
         pairs = zip(self._albedo, light, strict=True)
-        return [multiply_scaled(self.matrix, rho[None], self.nodes.spread(x))[0] for rho, x in pairs]
+        return [multiply_scaled(self.matrix, rho[None], self.nodes.interpolate(x))[0] for rho, x in pairs]
 
 
 class RadiositySolver(FiniteElements):

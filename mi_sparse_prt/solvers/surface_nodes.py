@@ -30,12 +30,12 @@ class Nodes:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def spread(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+    def interpolate(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Light (n, k) of the nodes, interpolated at all vertices (n_v, k)."""
         return light if self.weights is None else multiply_sparse(self.weights, light)
 
-    def collect(self, weights: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The transpose of ``spread``: weights of all vertices (n_v, k) as weights of nodes (n, k)."""
+    def interpolate_adjoint(self, weights: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The transpose of ``interpolate``: weights of all vertices (n_v, k) as weights of nodes (n, k)."""
         return weights if self.weights is None else multiply_sparse(self._transposed, weights)
 
     @cached_property

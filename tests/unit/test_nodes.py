@@ -47,8 +47,8 @@ def test_constants_and_linear_functions_are_kept(scene):
     """Rows of weights sum to 1; inside of the flat ground, positions are met within a tenth of a node's spacing."""
     nodes = choose_nodes(scene, vertex_points(scene), 1000)
     one = np.ones((len(nodes), 1), np.float32)
-    assert np.abs(nodes.spread(one) - 1).max() < 1e-5
-    spread = nodes.spread(scene.positions[nodes.ids])
+    assert np.abs(nodes.interpolate(one) - 1).max() < 1e-5
+    spread = nodes.interpolate(scene.positions[nodes.ids])
     ground = scene.meshes[0].vertices
     inside = (np.abs(scene.positions[ground][:, [0, 2]]) < 1.2).all(axis=1)
     error = (spread - scene.positions)[ground][inside]
@@ -61,7 +61,10 @@ def test_collect_is_the_transpose_of_spread(scene):
     rng = np.random.default_rng(0)
     light = rng.normal(size=(len(nodes), 9)).astype(np.float32)
     weights = rng.normal(size=(scene.n_vertices, 9)).astype(np.float32)
-    left, right = np.vdot(weights, nodes.spread(light)), np.vdot(nodes.collect(weights), light)
+    left, right = (
+        np.vdot(weights, nodes.interpolate(light)),
+        np.vdot(nodes.interpolate_adjoint(weights), light),
+    )
     assert left == pytest.approx(right, rel=1e-4)
 
 

@@ -16,7 +16,7 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.candidates import Ranking
+from mi_sparse_prt.planner.candidates import CandidatePlans
 from mi_sparse_prt.planner.choice import (
     MARGIN,
     Costs,
@@ -239,9 +239,9 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
     assert [uncertain(Costs(0, BOTH), target) for target in (0.003, 0.02, 0.05)] == [None, "consensus", None]
     assert uncertain(Costs(0, EXACT), 0.02) is None
     for error, seconds, plan in ((0.021, 1 + 4.0, "consensus"), (0.023, 1 + 14.0, "exact")):
-        ranking = Ranking(Costs(1, BOTH, direct_share=0.9), Settings(4, target_error=0.02))
+        ranking = CandidatePlans(Costs(1, BOTH, direct_share=0.9), Settings(4, target_error=0.02))
         assert ranking.uncertain == "consensus"
-        ranking.judged("consensus", error)
+        ranking.choose_again("consensus", error)
         assert (ranking.plan, ranking.seconds) == (Plan(plan), seconds)
         assert {p["direct"]: p["predicted_error"] for p in ranking.report()} == {
             "consensus": pytest.approx(0.9 * error),
@@ -252,7 +252,7 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
 @pytest.mark.parametrize(("target", "plan"), [(0.5, "consensus"), (1e-6, "exact")])
 def test_direct_light_that_was_tried_counts_once(grey_scene, monkeypatch, target, plan):
     """Rays of a trial are among those of the matrix, whether the trial was good enough or all were traced after it."""
-    monkeypatch.setattr(Ranking, "uncertain", property(lambda self: "consensus"))
+    monkeypatch.setattr(CandidatePlans, "uncertain", property(lambda self: "consensus"))
     found = prt.precompute(grey_scene, LIGHTING, max_depth=2, target_error=target, progress=False)
     consensus, exact = (
         prt.precompute(grey_scene, LIGHTING, Plan(how), max_depth=2, progress=False)
@@ -269,7 +269,7 @@ def test_direct_light_that_was_tried_counts_once(grey_scene, monkeypatch, target
 def test_what_takes_very_long_is_left_to_the_user(path, long):
     """After a plan of some seconds, minutes are spent on a target that it missed, and days are not."""
     paths = PathCosts({32: path}, {32: 0.3}, {32: 0.0})
-    ranking = Ranking(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.03))
+    ranking = CandidatePlans(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.03))
     first = ranking.plan
     assert first.indirect == "gather"
     assert ranking.after(0.3) is not long
@@ -288,7 +288,7 @@ def test_short_of_what_takes_very_long_there_is_something_better():
         the noise is small beside the bias.
     """
     paths = PathCosts({32: 1e5}, {32: 0.3}, {32: 0.0})
-    ranking = Ranking(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.043))
+    ranking = CandidatePlans(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.043))
     assert (ranking.plan.indirect, ranking.plan.rays) == ("gather", 64)
     assert ranking.after(0.06)  # 4% of noise, 4.5% of bias
     assert (ranking.plan.indirect, ranking.plan.rays) == ("gather", 256)
