@@ -75,7 +75,7 @@ class SphereRows:
 
     def __init__(self, transport: LightTransport, items: Items) -> None:
         self._incident, self.items = transport.incident, items
-        self.scale = np.sqrt(transport.lighting.solid_angles).astype(np.float32)
+        self.scale = np.sqrt(transport.emission.weights).astype(np.float32)
         self._inverse = np.float32(1) / self.scale
         self.weights = items.areas if items.areas.any() else np.ones_like(items.areas)
         self._order = np.argsort(mix(items.keys), kind="stable")

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.environment import Environment, load_environment
@@ -75,6 +76,25 @@ class CubemapLighting:
     def size(self) -> int:
         """Elements of the basis: ``n_directions``."""
         return self.n_directions
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """Of texels in inner products: their solid angles."""
+        return self.solid_angles
+
+    def neighbours(self, count: int) -> NDArray[np.int32]:
+        """(6 n^2, count) nearest texels by their centres, each texel itself first; fewer if there are not so many."""
+        nearest = min(count, self.n_directions)
+        found = cKDTree(self.directions).query(self.directions, nearest)[1]
+        return found.reshape(self.n_directions, nearest).astype(np.int32)
+
+    def element_of(
+        self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
+    ) -> tuple[mi.Int32, mi.Color3f]:
+        """The texel that rays leave the scene towards, -1 for none, and radiance 1."""
+        leaves = active & ~si.is_valid()
+        texel = mi.Int32(texel_at(*face_coordinates(ray.d), self.resolution))
+        return dr.select(leaves, texel, -1), dr.select(leaves, mi.Color3f(1), 0)
 
     def attributes(self) -> dict[str, Any]:
         """What files keep of it; JSON as it is."""

@@ -73,6 +73,14 @@ class SceneEmitters:
         """Columns."""
         return len(self.names)
 
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """Of lamps in inner products: all count the same."""
+        return np.ones(self.size, np.float32)
+
+    def neighbours(self, count: int) -> None:
+        """Lamps have none."""
+
     def __repr__(self) -> str:
         return f"SceneEmitters({', '.join(self.names)})"
 
@@ -121,7 +129,9 @@ class SceneEmitters:
         found, weight = emitter.sample_direction(si, mi.Point2f(u - mi.Float(which), uv.y), mi.Mask(True))
         return found.d, mi.Color3f(weight) * mi.Float(count), found.dist
 
-    def element_of(self, si: mi.SurfaceInteraction3f, active: mi.Mask) -> tuple[mi.Int32, mi.Color3f]:
+    def element_of(
+        self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
+    ) -> tuple[mi.Int32, mi.Color3f]:
         """The element whose light rays meet, -1 for none, and its radiance along them."""
         emitter = si.emitter(self._scene, active)
         numbers = dr.reinterpret_array(mi.UInt32, self._scene.emitters_dr()).numpy()
@@ -157,6 +167,8 @@ class StoredEmitters:
         return SceneEmitters(scene, self.groups)
 
     size = SceneEmitters.size
+    weights = SceneEmitters.weights
+    neighbours = SceneEmitters.neighbours
     project = SceneEmitters.project
     attributes = SceneEmitters.attributes
     __repr__ = SceneEmitters.__repr__

@@ -24,6 +24,13 @@ class EmissionSpace(Protocol):
     @property
     def size(self) -> int: ...
 
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """(size,) of the inner product of rows: what an element counts in the error of light that spreads over all."""
+
+    def neighbours(self, count: int, /) -> NDArray[np.int32] | None:
+        """(size, count) elements nearest to each, itself first; None where elements have no neighbours."""
+
     def project(self, light: Any, /) -> NDArray[np.float32]:
         """Coefficients (size, 3) of a light: what T is multiplied with, linear RGB.
 
@@ -59,4 +66,22 @@ class SampledEmission(EmissionSpace, Protocol):
             At right angles to it, over the density of the sample.
         distance : Float, world units
             To the light.
+        """
+
+    def element_of(self, si: Any, ray: Any, active: Any, /) -> tuple[Any, Any]:
+        """The element whose light rays find, on the device.
+
+        Parameters
+        ----------
+        si : SurfaceInteraction3f
+            What rays meet, invalid where they leave the scene.
+        ray : Ray3f, world
+        active : Mask
+
+        Returns
+        -------
+        Int32
+            -1 where it is no light of this space.
+        Color3f
+            Its radiance along the ray, if the element has the coefficient 1.
         """

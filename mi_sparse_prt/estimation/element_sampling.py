@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
@@ -119,9 +118,7 @@ def for_direct_light(
         rays, floor = rays / FEW, BELOW_HORIZON
     if direct.edges is not None:
         rays /= NEAR_EDGES + (1 - NEAR_EDGES) * FAR_FROM_EDGES
-        nearest = min(AROUND + 1, lighting.n_directions)
-        around = cKDTree(lighting.directions).query(lighting.directions, nearest)[1]
-        edges = direct.edges[inside], around.astype(np.int32)
+        edges = direct.edges[inside], lighting.neighbours(AROUND + 1)
     return _by_cosine(lighting, normals[inside], inside.start, rays, floor, edges, rng)
 
 

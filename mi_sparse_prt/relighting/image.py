@@ -72,7 +72,7 @@ class RelitScene:
             value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
         if self._lamps is not None:
             emitters, brightness = self._lamps
-            lamp, radiance = emitters.element_of(si, active)
+            lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
         return value, valid
 
