@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_sparse_prt.benchmark.gallery import factor_picture
 from mi_sparse_prt.benchmark.measuring import kept_memory, report_header, timed
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.measurement.measurement import mesh_vertices
@@ -101,7 +102,7 @@ def measure_glossy(
         "brute_force": brute,
     }
     spp, width = effort.image_spp, effort.image_width
-    images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, progress=progress)
+    images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, run=Run(progress=progress))
     if figures is not None:
         images.save(figures)
         drawn = {

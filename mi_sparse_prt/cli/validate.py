@@ -47,6 +47,7 @@ def validate(
     with glossy surfaces, images from three cameras are compared, and errors split into their causes.
     """
     with running(json_file, quiet) as command:
+        from mi_sparse_prt.core.run import Run
         from mi_sparse_prt.cli.tables.validation import glossy_images_table, validation_table
         from mi_sparse_prt.validation.glossy_images import GlossyValidation, validate_glossy
 
@@ -56,7 +57,7 @@ def validate(
         result: prt.Validation | GlossyValidation
         with command.prompt_interrupts():
             if transport.terms:
-                result = validate_glossy(loaded, transport, spp=image_spp, seed=seed, progress=not quiet)
+                result = validate_glossy(loaded, transport, spp=image_spp, run=Run(seed, progress=not quiet))
             else:
                 result = prt.validate(
                     loaded,

@@ -60,7 +60,6 @@ def standard_cpca(
     centred: bool = True,
     seed: int = 0,
     exhaustive: bool = True,
-    iterations: int = ITERATIONS,
 ) -> Clusters:
     """Clustered PCA as [SHHS03] has it: vectors are added one by one, with LBG iterations for each.
 
@@ -77,8 +76,6 @@ def standard_cpca(
     seed : int
     exhaustive : bool
         Whether all clusters are compared each time, or, most of the time, those that were nearest the last time.
-    iterations : int
-        For each basis vector.
 
     Returns
     -------
@@ -87,7 +84,7 @@ def standard_cpca(
     """
     found, compared = seeded(rows, weights, clusters, centred, seed), 0
     for b in range(bases + 1):
-        for repeat in range(iterations if 0 < b < bases else SETTLING):
+        for repeat in range(ITERATIONS if 0 < b < bases else SETTLING):
             if exhaustive or (repeat == 0 and b % COMPARED == 0) or compared != len(found):
                 nearest = nearest_clusters(rows, found, 1 if exhaustive else CANDIDATES)
                 labels, compared = nearest[:, 0], len(found)
@@ -105,7 +102,6 @@ def two_pass_cpca(
     bases: int,
     centred: bool = True,
     seed: int = 0,
-    iterations: int = ITERATIONS,
 ) -> Clusters:
     """Clustered PCA of few items; the others then join their nearest clusters, and all settle ([HR10] 6, Figure 7).
 
@@ -115,7 +111,7 @@ def two_pass_cpca(
     weights : (n,) float32
     dense : (d,) int64
         Items of the first pass.
-    clusters, bases, centred, seed, iterations
+    clusters, bases, centred, seed
         As ``standard_cpca`` has them.
 
     Returns
@@ -123,9 +119,7 @@ def two_pass_cpca(
     Clusters
         Of all items.
     """
-    found = standard_cpca(
-        rows[dense], weights[dense], clusters, bases, centred, seed, exhaustive=False, iterations=iterations
-    )
+    found = standard_cpca(rows[dense], weights[dense], clusters, bases, centred, seed, exhaustive=False)
     return settled(rows, weights, found, bases, centred)
 
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.metrics import flip_map, relative_l2_without_noise, relative_noise
 from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
@@ -80,8 +81,7 @@ def validate_glossy(
     sensors: Sequence[mi.Sensor] | None = None,
     spp: int = 256,
     width: int = 320,
-    seed: int = 0,
-    progress: bool = False,
+    run: Run | None = None,
 ) -> GlossyValidation:
     """Compare relit images of a glossy scene with Mitsuba's ``path``, cause by cause.
 
@@ -99,9 +99,8 @@ def validate_glossy(
         Samples per pixel of each image, in two halves.
     width : int
         Of images, pixels; sensors keep their films' shape, and get their own size back.
-    seed : int
-    progress : bool
-        Show a progress bar.
+    run : Run, optional
+        Its seed, and whether a progress bar is shown.
 
     Returns
     -------
@@ -121,6 +120,7 @@ def validate_glossy(
     Thin shadows are the tenth of the pixels on smooth surfaces where the share of direct light that is not shadowed (of
     all that is in front of the surface, whatever its BSDF) changes most from pixel to pixel.
     """
+    run = run or Run()
     if spp < 2:
         raise PrtError(f"validate_glossy: spp is {spp}; give at least 2, for two halves")
     transport = transport.for_scene(scene)
@@ -131,15 +131,15 @@ def validate_glossy(
         environments = {"scene": own}
     images, figures = [], {}
     with tqdm(
-        total=len(environments) * len(views), desc="images", unit=" images", disable=not progress
+        total=len(environments) * len(views), desc="images", unit=" images", disable=not run.progress
     ) as bar:
         for i, (name, environment) in enumerate(environments.items()):
             radiance = transport.lighting.project(environment)
             references = _References(scene, transport, radiance)
             for j, (sensor, turn) in enumerate(views):
                 with posed(sensor, width, turn, scene.centre):
-                    regions = references.regions(sensor, spp, _seed(seed, i, j, 99))
-                    rendered = references.rendered(sensor, spp, (seed, i, j))
+                    regions = references.regions(sensor, spp, _seed(run.seed, i, j, 99))
+                    rendered = references.rendered(sensor, spp, (run.seed, i, j))
                 camera = {"number": j} if sensors else {"number": j, "turned": turn}
                 entry, figure = _compared(rendered, regions)
                 images.append({"environment": name, "camera": camera, **entry})
@@ -148,7 +148,7 @@ def validate_glossy(
     report = {
         "images": images,
         "worst": _worst(images),
-        "parameters": {"spp": spp, "width": width, "seed": seed} | transport.report.get("parameters", {}),
+        "parameters": {"spp": spp, "width": width, "seed": run.seed} | transport.report.get("parameters", {}),
     }
     return GlossyValidation(report, figures)
 
