@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
+import psutil
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
@@ -33,6 +34,7 @@ from mi_sparse_prt.scene.scene import Scene
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
+    from xarray import DataArray
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 7
@@ -230,6 +232,47 @@ class LightTransport:
         """Products of the transpose: (n, 3, k) to (n_directions, 3, k)."""
         outgoing = self.measurement.spread(np.asarray(y, np.float32))
         return self.incident.adjoint(self.reflection.radiosity_adjoint(outgoing))
+
+    def to_xarray(self, ids: ArrayLike | None = None) -> DataArray:
+        """Rows of T with names for all that they hold, for notebooks; needs the package ``xarray``.
+
+        Parameters
+        ----------
+        ids : (k,) integers, optional
+            As for ``rows``; all of them if not given, which are 4 x 3 x n x n_directions bytes.
+
+        Returns
+        -------
+        xarray.DataArray
+            Dimensions ``row``, ``element`` and ``channel``. Coordinates: ``id`` and ``group`` (mesh or image) of rows;
+            of elements what the emission space calls them; ``attrs`` has the parameters of the precomputation.
+
+        Raises
+        ------
+        PrtError
+            If xarray is not installed, an index is out of range, or there is not enough memory.
+        """
+        try:
+            from xarray import DataArray
+        except ImportError:
+            raise PrtError("to_xarray needs the package xarray: pip install xarray") from None
+        chosen = np.arange(self.shape[0]) if ids is None else np.asarray(ids)
+        needed = 4.0 * len(chosen) * self.shape[1] * self.shape[2]
+        if needed > psutil.virtual_memory().available:
+            raise PrtError(f"to_xarray: {len(chosen)} rows are {needed / 1e9:.1f} GB; ask for some rows")
+        elements = {name: ("element", values) for name, values in self.emission.coordinates.items()}
+        return DataArray(
+            self.rows(chosen),
+            dims=("row", "element", "channel"),
+            coords={
+                "id": ("row", chosen),
+                "group": ("row", self.measurement.group_names[chosen]),
+                "channel": ["r", "g", "b"],
+                **elements,
+            },
+            name="T",
+            attrs={"basis": self.basis, **self.report.get("parameters", {})},
+        )
 
     def as_linear_operator(self, channel: int | None = None) -> LinearOperator:
         """T for SciPy's iterative methods.

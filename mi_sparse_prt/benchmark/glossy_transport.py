@@ -102,7 +102,9 @@ def measure_glossy(
         "brute_force": brute,
     }
     spp, width = effort.image_spp, effort.image_width
-    images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, run=Run(progress=progress))
+    images = validate_glossy(
+        scene, transport, _environments(scene), spp=spp, width=width, run=Run(progress=progress)
+    )
     if figures is not None:
         images.save(figures)
         drawn = {

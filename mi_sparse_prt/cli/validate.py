@@ -47,8 +47,8 @@ def validate(
     with glossy surfaces, images from three cameras are compared, and errors split into their causes.
     """
     with running(json_file, quiet) as command:
-        from mi_sparse_prt.core.run import Run
         from mi_sparse_prt.cli.tables.validation import glossy_images_table, validation_table
+        from mi_sparse_prt.core.run import Run
         from mi_sparse_prt.validation.glossy_images import GlossyValidation, validate_glossy
 
         if output is not None:

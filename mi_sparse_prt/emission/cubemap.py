@@ -82,6 +82,11 @@ class CubemapLighting:
         """Of texels in inner products: their solid angles."""
         return self.solid_angles
 
+    @property
+    def coordinates(self) -> dict[str, NDArray[Any]]:
+        """Of texels: ``x``, ``y``, ``z`` of the direction (world), ``solid_angle`` (sr)."""
+        return dict(zip("xyz", self.directions.T, strict=True)) | {"solid_angle": self.solid_angles}
+
     def neighbours(self, count: int) -> NDArray[np.int32]:
         """(6 n^2, count) nearest texels by their centres, each texel itself first; fewer if there are not so many."""
         nearest = min(count, self.n_directions)

@@ -78,6 +78,11 @@ class SceneEmitters:
         """Of lamps in inner products: all count the same."""
         return np.ones(self.size, np.float32)
 
+    @property
+    def coordinates(self) -> dict[str, NDArray[Any]]:
+        """Of lamps: ``lamp``, their names."""
+        return {"lamp": np.array(self.names)}
+
     def neighbours(self, count: int) -> None:
         """Lamps have none."""
 
@@ -168,6 +173,7 @@ class StoredEmitters:
 
     size = SceneEmitters.size
     weights = SceneEmitters.weights
+    coordinates = SceneEmitters.coordinates
     neighbours = SceneEmitters.neighbours
     project = SceneEmitters.project
     attributes = SceneEmitters.attributes

@@ -28,6 +28,10 @@ class EmissionSpace(Protocol):
     def weights(self) -> NDArray[np.float32]:
         """(size,) of the inner product of rows: what an element counts in the error of light that spreads over all."""
 
+    @property
+    def coordinates(self) -> dict[str, NDArray[Any]]:
+        """What elements are called: names of coordinates, each with an array (size,)."""
+
     def neighbours(self, count: int, /) -> NDArray[np.int32] | None:
         """(size, count) elements nearest to each, itself first; None where elements have no neighbours."""
 

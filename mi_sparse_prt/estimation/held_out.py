@@ -157,11 +157,10 @@ class _Estimator:
         self._direct, self._indirect = transport.operators["direct"], transport.operators.get("indirect")
         self._seeds = element_seeds(stream, 4)
         self._rays = DirectSolver(problem, effort.strata, self._seeds[0])
+        self._paths = PathSolver(problem, effort.spp, self._seeds[2])
         if isinstance(problem.reflection, InOutFactors):
             self._term_rays = TermRays(self._rays, problem.reflection)
-            self._paths: PathSolver = TermPaths(problem, effort.spp // 2, self._seeds[2])
-        else:
-            self._paths = PathSolver(problem, effort.spp, self._seeds[2])
+            self._term_paths = TermPaths(problem, effort.spp // 2, self._seeds[2])
 
     def samples(self, rng: np.random.Generator, part: float) -> Samples:
         """Elements of each mesh, for direct and for indirect light."""
@@ -192,21 +191,20 @@ class _Estimator:
     def _true_indirect(self, chosen: Chosen) -> tuple[Doubles, Doubles, Doubles]:
         """Indirect light (m, rows, channels) twice, and what the product of the two has of variance.
 
-        Rows of a glossy point have noise in common, since paths are: two halves of the paths tell them apart. The mean
-        of all and its variance are nearer to the truth where there is one row.
+        Where there is one row, that is the mean of all paths and its variance. Rows of a glossy point have noise in
+        common, since paths are: two halves of the paths tell them apart.
         """
-        solid_angles = self._problem.emission.solid_angles[chosen.texels].astype(np.float64)[:, None, None]
-        rows, shape = self._rows_per_point(chosen), (len(chosen.vertices), -1, self._problem.channels)
-
-        def true(estimate: NDArray[np.float32], power: Doubles) -> Doubles:
-            return estimate.reshape(shape)[:, :rows] * power
-
-        estimate = self._paths.elements(chosen.vertices, chosen.texels)
-        mean = true(estimate.mean, solid_angles)
-        if not isinstance(self._problem.reflection, InOutFactors):
-            return mean, mean, true(estimate.variance, solid_angles**2)
-        other = self._paths.elements(chosen.vertices, chosen.texels, self._seeds[3])
-        return mean, true(other.mean, solid_angles), np.zeros_like(mean)
+        asked, rows = (chosen.vertices, chosen.texels), self._rows_per_point(chosen)
+        power = self._problem.emission.solid_angles[chosen.texels].astype(np.float64)[:, None, None]
+        shape = len(chosen.vertices), rows, self._problem.channels
+        if rows == 1:
+            estimate = self._paths.elements(*asked)
+            mean = estimate.mean.reshape(shape) * power
+            return mean, mean, estimate.variance.reshape(shape) * power**2
+        first, second = (
+            self._term_paths.elements(*asked, seed).mean.reshape(shape) * power for seed in self._seeds[2:]
+        )
+        return first, second, np.zeros_like(first)
 
     def _sample(
         self,

@@ -91,6 +91,17 @@ class Measurement:
         return len(self) if self.weights is None else int(self.weights.shape[0])
 
     @property
+    def group_names(self) -> NDArray[np.str_]:
+        """(outputs,) name of the mesh that each output is of, "image" where outputs are pixels."""
+        if self.weights is not None:
+            return np.full(self.outputs, "image")
+        names, sizes = (
+            [g.name for g in self.groups],
+            [g.vertices.stop - g.vertices.start for g in self.groups],
+        )
+        return np.repeat(np.array(names, np.str_), sizes)
+
+    @property
     def points(self) -> SurfacePoints:
         """Positions, normals and ray offsets, world space, for which the rows hold.
 

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.metrics import flip_map, relative_l2_without_noise, relative_noise
+from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter

@@ -36,6 +36,7 @@ def test_its_size_and_weights(space):
     assert space.weights.dtype == np.float32
     assert (space.weights > 0).all()
     json.dumps(space.attributes())
+    assert all(len(values) == space.size for values in space.coordinates.values())
 
 
 def test_light_is_projected_or_refused(space):

@@ -1,6 +1,7 @@
 """The result as a whole: its transpose, its operator for SciPy, glossy rows as means over views, files, signatures."""
 
 import inspect
+import sys
 import zipfile
 from collections.abc import Callable
 
@@ -536,3 +537,36 @@ def test_one_class_of_results():
     assert all(hasattr(transport, name) for name in names)
     assert transport.terms == 0
     assert made_up_glossy("glossy").terms == TERMS
+
+
+@pytest.mark.parametrize("form", ["bits and coarse indirect", "clusters"])
+def test_to_xarray(form):
+    """Rows as they are, by names: those of a mesh, and texels above the horizon."""
+    transport, ids = made_up(form), [3, 1, 40]
+    found = transport.to_xarray(ids)
+    assert found.dims == ("row", "element", "channel")
+    assert np.array_equal(found.values, transport.rows(ids))
+    assert found.attrs["basis"] == transport.basis
+    assert list(found.id) == ids
+    names = [next(m.name for m in transport.meshes if m.vertices.start <= i < m.vertices.stop) for i in ids]
+    assert list(found.group.values) == names
+    above = found.isel(element=found.y.values > 0.5).sel(channel="g")
+    assert np.array_equal(above.values, transport.rows(ids)[:, transport.lighting.directions[:, 1] > 0.5, 1])
+    assert len(transport.to_xarray()) == transport.shape[0]
+    with pytest.raises(prt.PrtError):
+        transport.to_xarray([transport.shape[0]])
+
+
+def test_to_xarray_says_what_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(prt.PrtError, match="pip install xarray"):
+        made_up("bits").to_xarray([0])
+
+
+def test_to_xarray_refuses_what_does_not_fit(monkeypatch):
+    class Memory:
+        available = 1000
+
+    monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
+    with pytest.raises(prt.PrtError, match="ask for some rows"):
+        made_up("bits").to_xarray()
