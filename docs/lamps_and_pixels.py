@@ -45,12 +45,12 @@ def draw_lamps() -> None:
     images["all"] = prt.render(scene, transport, 1.0, spp=64, progress=False)
     images["Mitsuba path"], noise = reference(lit, lit.sensors()[0])
     compare("lamps", images["all"], images["Mitsuba path"], noise)
-    draw(images, np.percentile(images["all"], 90), IMAGES / "lamps.jpg")
+    draw(images, np.percentile(images["all"], 98), IMAGES / "lamps.jpg")
 
 
 def draw_pixels() -> None:
     """A textured model by interpolation between vertices, by rows at the pixels, and by Mitsuba."""
-    scene = prt.load_scene(ROOT / "scenes_xml" / "spot.xml", width=240, height=180)
+    scene = prt.load_scene(ROOT / "scenes_xml" / "spot.xml", width=160, height=120)
     lighting, light = prt.CubemapLighting(16), prt.load_environment(ROOT / "scenes_xml/envmaps/studio.exr")
     texels = lighting.project(light)
     images = {}
