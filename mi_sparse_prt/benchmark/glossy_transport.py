@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mi_sparse_prt.benchmark.gallery import factor_picture
+from mi_sparse_prt.benchmark.gallery import factor_pictures
 from mi_sparse_prt.benchmark.measuring import kept_memory, report_header, timed
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment, load_environment
@@ -18,13 +18,12 @@ from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.reflection.brdf_factors import measure_factor_error
-from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.materials import bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.glossy_images import validate_glossy, with_bsdf
+from mi_sparse_prt.validation.glossy_images import factored_surfaces, validate_glossy, with_bsdf
 from mi_sparse_prt.validation.validate import save_figures
 
 STUDIO = Path(__file__).parents[2] / "scenes_xml/envmaps/studio.exr"
@@ -104,10 +103,7 @@ def measure_glossy(
     images = validate_glossy(scene, transport, _environments(scene), spp=spp, width=width, progress=progress)
     if figures is not None:
         images.save(figures)
-        drawn = {
-            f"factors_{k}": factor_picture(factors) for k, factors in enumerate(_surfaces(transport).factors)
-        }
-        save_figures(figures, drawn)
+        save_figures(figures, factor_pictures(transport))
     return {
         **report_header(scene, lighting),
         "parameters": transport.report["parameters"],
@@ -156,15 +152,10 @@ def _time_brute_force(scene: Scene, transport: LightTransport, effort: GlossyEff
     return elapsed / effort.rows * len(points)
 
 
-def _surfaces(transport: LightTransport) -> InOutFactors:
-    assert isinstance(transport.reflection, InOutFactors)
-    return transport.reflection
-
-
 def _factor_errors(scene: Scene, transport: LightTransport) -> list[Report]:
     errors = []
-    for number, factors in enumerate(_surfaces(transport).factors):
-        vertex = int(np.flatnonzero(_surfaces(transport).material == number)[0])
+    for number, factors in enumerate(factored_surfaces(transport).factors):
+        vertex = int(np.flatnonzero(factored_surfaces(transport).material == number)[0])
         mesh, material = next(
             (m, k) for m, k in zip(scene.meshes, scene.materials, strict=True) if m.vertices.stop > vertex
         )

@@ -9,7 +9,7 @@ From Mitsuba's image of the real BSDFs to ours there are three steps, each betwe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -26,10 +26,11 @@ from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, read_mesh
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.mitsuba_reference import lit_scene, posed
+from mi_sparse_prt.validation.mitsuba_reference import lit_scene, path_image, posed
 from mi_sparse_prt.validation.validate import Validation
 
 if TYPE_CHECKING:
@@ -62,8 +63,8 @@ class GlossyValidation(Validation):
     Attributes
     ----------
     report : dict
-        JSON as it is. ``images``: for each, ``environment``, ``camera`` (its number and, by default, the degrees by
-        which it is turned), ``pixels`` (shares of the image), ``noise`` (relative L2 of the reference, FLIP between its
+        JSON as it is. ``images``: for each, ``environment``, ``camera`` (its number, and the degrees by which it is
+        turned), ``pixels`` (shares of the image), ``noise`` (relative L2 of the reference, FLIP between its
         halves), and for each region (``image``, ``glossy``, ``thin_shadows``) and cause (``total``, ``factorization``,
         ``lighting``, ``transport``) ``relative_l2``, its ``uncertainty`` (what noise alone may show) and ``flip``. A
         region without pixels is missing. ``worst``: the largest relative L2 of each cause in each region.
@@ -77,13 +78,15 @@ def validate_glossy(
     scene: Scene,
     transport: LightTransport,
     environments: Mapping[str, Environment | mi.Emitter | ArrayLike] | None = None,
-    sensors: Sequence[mi.Sensor] | None = None,
     spp: int = 256,
     width: int = 320,
     seed: int = 0,
     progress: bool = False,
 ) -> GlossyValidation:
     """Compare relit images of a glossy scene with Mitsuba's ``path``, cause by cause.
+
+    Images are those of the scene's first sensor, and of the same turned by 60 and by -60 degrees about the world's Y
+    axis (Mitsuba's upwards) through the scene's centre.
 
     Parameters
     ----------
@@ -92,13 +95,10 @@ def validate_glossy(
     transport : LightTransport
     environments : mapping of names to environments, emitters or texel radiances (n_directions, 3), optional
         All are projected to the transport's lighting first, for all images. Default: the scene's own.
-    sensors : sequence of mi.Sensor, optional
-        Default: the scene's first, and the same turned by 60 and by -60 degrees about the world's Y axis (Mitsuba's
-        upwards) through the scene's centre.
     spp : int
         Samples per pixel of each image, in two halves.
     width : int
-        Of images, pixels; sensors keep their films' shape, and get their own size back.
+        Of images, pixels; the sensor keeps its film's shape, and gets its own size back.
     seed : int
     progress : bool
         Show a progress bar.
@@ -124,25 +124,26 @@ def validate_glossy(
     if spp < 2:
         raise PrtError(f"validate_glossy: spp is {spp}; give at least 2, for two halves")
     transport = transport.for_scene(scene)
-    own, views = scene.mitsuba.environment(), _views(scene, sensors)
     if environments is None:
+        own = scene.mitsuba.environment()
         if own is None:
             raise PrtError("validate_glossy: the scene has no environment emitter; give environments")
         environments = {"scene": own}
+    if not scene.mitsuba.sensors():
+        raise PrtError("validate_glossy: the scene has no sensor")
+    sensor = scene.mitsuba.sensors()[0]
     images, figures = [], {}
-    with tqdm(
-        total=len(environments) * len(views), desc="images", unit=" images", disable=not progress
-    ) as bar:
+    count = len(environments) * len(TURNS)
+    with tqdm(total=count, desc="images", unit=" images", disable=not progress) as bar:
         for i, (name, environment) in enumerate(environments.items()):
             radiance = transport.lighting.project(environment)
             references = _References(scene, transport, radiance)
-            for j, (sensor, turn) in enumerate(views):
+            for j, turn in enumerate(TURNS):
                 with posed(sensor, width, turn, scene.centre):
                     regions = references.regions(sensor, spp, _seed(seed, i, j, 99))
                     rendered = references.rendered(sensor, spp, (seed, i, j))
-                camera = {"number": j} if sensors else {"number": j, "turned": turn}
                 entry, figure = _compared(rendered, regions)
-                images.append({"environment": name, "camera": camera, **entry})
+                images.append({"environment": name, "camera": {"number": j, "turned": turn}, **entry})
                 figures[f"{name}_{j}"] = figure
                 bar.update()
     report = {
@@ -151,15 +152,6 @@ def validate_glossy(
         "parameters": {"spp": spp, "width": width, "seed": seed} | transport.report.get("parameters", {}),
     }
     return GlossyValidation(report, figures)
-
-
-def _views(scene: Scene, sensors: Sequence[mi.Sensor] | None) -> list[tuple[mi.Sensor, int]]:
-    """Sensors and the degrees by which they are turned."""
-    if sensors is not None:
-        return [(sensor, 0) for sensor in sensors]
-    if not scene.mitsuba.sensors():
-        raise PrtError("validate_glossy: the scene has no sensor; give sensors")
-    return [(scene.mitsuba.sensors()[0], turn) for turn in TURNS]
 
 
 def _seed(*numbers: int) -> int:
@@ -248,7 +240,10 @@ class _References:
         """Pixels (height, width) of the whole image, on glossy surfaces, and in thin shadows."""
         shape, normal = self._seen(sensor)
         image = np.ones(shape.shape, bool)
-        found = _surfaces(self._transport).material[[mesh.vertices.start for mesh in self._scene.meshes]] >= 0
+        found = (
+            factored_surfaces(self._transport).material[[mesh.vertices.start for mesh in self._scene.meshes]]
+            >= 0
+        )
         glossy = np.append(found, False)[shape]  # -1: none
         light = self._path("diffuse", sensor, 2, 4 * spp, seed).mean(axis=2)
         unshadowed = self._unshadowed(normal.reshape(-1, 3)).reshape(shape.shape)
@@ -267,9 +262,7 @@ class _References:
         return np.concatenate(parts)
 
     def _path(self, name: str, sensor: mi.Sensor, max_depth: int, spp: int, seed: int) -> Image:
-        path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": MOST_BOUNCES + 1})
-        rendered = mi.render(self._lit[name], sensor=sensor, integrator=path, spp=spp, seed=seed)
-        return np.array(rendered)[..., :3]
+        return path_image(self._lit[name], sensor, max_depth, spp, seed, rr_depth=MOST_BOUNCES + 1)
 
     def _seen(self, sensor: mi.Sensor) -> tuple[NDArray[np.int64], Image]:
         """Number of the mesh (height, width), -1 for none, and normal (height, width, 3) at pixels' centres."""
@@ -307,14 +300,15 @@ def thin_shadows(lit: Image, shape: NDArray[np.integer], normal: Image) -> Mask:
     return found
 
 
-def _surfaces(transport: LightTransport) -> InOutFactors:
+def factored_surfaces(transport: LightTransport) -> InOutFactors:
+    """The reflection of a transport with terms."""
     assert isinstance(transport.reflection, InOutFactors)
     return transport.reflection
 
 
 def _factored_shapes(scene: Scene, transport: LightTransport, shapes: list[mi.Mesh]) -> list[mi.Mesh]:
     """The meshes with the glossy BSDFs replaced by the transport's factors of them."""
-    found, surfaces = [], _surfaces(transport)
+    found, surfaces = [], factored_surfaces(transport)
     for shape, mesh, own in zip(shapes, scene.meshes, scene.materials, strict=True):
         number = int(surfaces.material[mesh.vertices.start])
         if number >= 0:
@@ -325,24 +319,7 @@ def _factored_shapes(scene: Scene, transport: LightTransport, shapes: list[mi.Me
 
 def with_bsdf(mesh: mi.Mesh, bsdf: mi.BSDF) -> mi.Mesh:
     """A copy with another BSDF and the same vertices, normals and texture coordinates."""
-    properties = mi.Properties()
-    properties["bsdf"] = bsdf
-    textured = mesh.has_vertex_texcoords()
-    copy = mi.Mesh(
-        mesh.id(),
-        mesh.vertex_count(),
-        mesh.face_count(),
-        props=properties,
-        has_vertex_normals=True,
-        has_vertex_texcoords=textured,
-    )
-    theirs, ours = mi.traverse(mesh), mi.traverse(copy)
-    for key in ("faces", "vertex_positions", *(["vertex_texcoords"] if textured else [])):
-        ours[key] = theirs[key]
-    ours.update()
-    ours["vertex_normals"] = theirs["vertex_normals"]  # Mitsuba makes its own whenever positions change
-    ours.update()
-    return copy
+    return build_mitsuba_mesh(read_mesh(mesh, mesh.id()), bsdf)
 
 
 def _compared(rendered: dict[str, Halves], regions: dict[str, Mask]) -> tuple[dict[str, Any], Figure]:
@@ -385,9 +362,7 @@ def _worst(images: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 def _figure(means: dict[str, Image], regions: dict[str, Mask], entry: dict[str, Any]) -> Figure:
     """Ours, Mitsuba's, Mitsuba's with factors; below them the differences ([HR10] Figures 17 to 19)."""
-    from matplotlib.figure import Figure
-
-    from mi_sparse_prt.validation.matrix_figures import tonemapped
+    from mi_sparse_prt.validation.matrix_figures import draw_picture, panels, tonemapped
 
     shown = {"ours": "ours, relit", "real": "Mitsuba path", "factored": "Mitsuba path, factored BRDFs"}
     # one tone curve for all three, so that they can be compared
@@ -396,23 +371,19 @@ def _figure(means: dict[str, Image], regions: dict[str, Mask], entry: dict[str, 
     for region, colour in (("glossy", (1.0, 0.8, 0.4)), ("thin_shadows", (1.0, 0.0, 0.4))):
         marked[regions[region]] *= colour
     height, width = means["real"].shape[:2]
-    figure = Figure(figsize=(17, 1.6 + 7 * height / width), layout="constrained")
-    above, below = figure.subplots(2, 4)
+    figure, (above, below) = panels(17, 1.6 + 7 * height / width, 2, 4)
     titles = (*shown.values(), "glossy (yellow), thin shadows (red)")
     for axes, picture, title in zip(above, (*toned, marked), titles, strict=True):
-        axes.imshow(np.clip(picture, 0, 1))
-        axes.set_title(title, fontsize=10)
+        draw_picture(axes, np.clip(picture, 0, 1), title, 10)
     scale = max(float(np.abs(means["real"]).mean()), 1e-20)
     for axes, (cause, (a, b)) in zip(below, CAUSES.items(), strict=True):
         difference = (means[a] - means[b]) / scale
         largest = np.abs(difference).argmax(axis=2, keepdims=True)  # a channel: others may make up for it
         signed = np.take_along_axis(difference, largest, axis=2)[..., 0]
-        drawn = axes.imshow(signed, vmin=-0.5, vmax=0.5, cmap="RdBu_r")
         errors = [
             f"{r.replace('_', ' ')} {entry[r][cause]['relative_l2']:.1%}" for r in regions if r in entry
         ]
-        axes.set_title(f"{cause}, relative L2\n{', '.join(errors)}", fontsize=10)
-    for axes in (*above, *below):
-        axes.axis("off")
+        title = f"{cause}, relative L2\n{', '.join(errors)}"
+        drawn = draw_picture(axes, signed, title, 10, vmin=-0.5, vmax=0.5, cmap="RdBu_r")
     figure.colorbar(drawn, ax=below, shrink=0.9, label="largest difference / mean of Mitsuba's")
     return figure
