@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.benchmark.column_sampling import CHOICES, SHARE, Columns, columns_of_regions, regions
 from mi_sparse_prt.benchmark.exact_rows import mesh_named, trace_visibility, unit_albedo_rows, values_at
 from mi_sparse_prt.benchmark.measuring import timed
-from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.core.bits import Bits, bits_at
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import relative_l2_of_sample
 from mi_sparse_prt.emission.cubemap import CubemapLighting
@@ -29,6 +29,7 @@ from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_dense, choose
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import diffuse_problem
+from mi_sparse_prt.validation.matrix_figures import panels
 
 PAPER = Huang2010Options()
 ROWS = 0.25  # Figure 5
@@ -74,8 +75,7 @@ class _Surface:
         """Directions that the second angular pass would add at these vertices."""
 
         def visible(rows: NDArray[np.uint32], texels: NDArray[np.uint32]) -> NDArray[np.bool_]:
-            words = self.bits[ids[rows], texels >> np.uint32(5)]
-            return (words >> (texels & np.uint32(31)) & np.uint32(1)).astype(bool)
+            return bits_at(self.bits, ids[rows], texels).astype(bool)
 
         return AngularGrid(self.lighting).sample(self.normals[ids], visible).features
 
@@ -206,8 +206,7 @@ def compare_choices(
 
 def plot_choices(report: dict[str, Any]) -> Figure:
     """Errors of ``compare_choices`` as bars, standard errors on them, and the share of directions that was used."""
-    figure = Figure(figsize=(8.5, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = panels(8.5, 4)
     labels = FITTED | INTERPOLATED
     errors = [100 * report["error"][name] for name in labels]
     colours = ["tab:red", *["tab:blue"] * (len(FITTED) - 1), *["0.6"] * len(INTERPOLATED)]

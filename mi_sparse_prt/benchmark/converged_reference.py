@@ -11,6 +11,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.brute_force import RowsTime, time_rows
 from mi_sparse_prt.benchmark.direct_error import BLOCK, DirectError, direct_error
+from mi_sparse_prt.benchmark.exact_rows import trace_visibility
 from mi_sparse_prt.benchmark.measuring import timed
 from mi_sparse_prt.benchmark.sampled_norms import (
     MeanSquare,
@@ -112,7 +113,9 @@ class Reference:
         self._meshes = {mesh.name: mesh.vertices for mesh in scene.meshes}
         self._sizes = {name: inside.stop - inside.start for name, inside in self._meshes.items()}
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3].astype(np.float64)
-        self.direct_seconds, bits = self._trace_direct()
+        direct, everyone = DirectSolver(self._problem), np.arange(len(self.points), dtype=np.uint32)
+        direct.rows(everyone[:16])  # compiles
+        self.direct_seconds, bits = timed(trace_visibility, direct, everyone)
         self.direct = Visibility(bits, scene.normals, lighting)
         rng, every = np.random.default_rng(1), np.arange(lighting.n_directions)
         vertices = self._draw_vertices(effort.vertices, rng)
@@ -259,18 +262,6 @@ class Reference:
             name: self._meshes[name].start + np.sort(rng.choice(n, min(n, of_each), replace=False))
             for name, n in self._sizes.items()
         }
-
-    def _trace_direct(self) -> tuple[float, NDArray[Any]]:
-        solver = DirectSolver(self._problem)
-        stored = solver.row_storage(len(self.points))
-        solver.rows(np.arange(min(16, len(stored)), dtype=np.uint32))  # compiles
-
-        def trace() -> None:
-            for a in range(0, len(stored), solver.block_size):
-                ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
-                stored[a : a + len(ids)] = solver.rows(ids)
-
-        return timed(trace)[0], stored
 
     def _trace(
         self,

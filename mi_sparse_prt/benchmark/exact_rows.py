@@ -12,8 +12,6 @@ from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
-ROWS = 256  # expanded at a time
-
 
 def mesh_named(scene: Scene, name: str) -> Mesh:
     """The mesh of this name, or an error that lists all names."""
@@ -26,20 +24,15 @@ def mesh_named(scene: Scene, name: str) -> Mesh:
 
 def trace_visibility(direct: DirectSolver, ids: NDArray[np.integer]) -> Bits:
     """Visibility (n, words) of whole rows, every element traced."""
-    blocks = [direct.rows(ids[a : a + direct.block_size]) for a in range(0, len(ids), direct.block_size)]
-    return np.concatenate([direct.row_storage(0), *blocks]).astype(np.uint32, copy=False)
+    blocks = np.split(ids, range(direct.block_size, len(ids), direct.block_size))
+    return np.concatenate([direct.rows(block) for block in blocks]).astype(np.uint32, copy=False)
 
 
 def unit_albedo_rows(
     bits: Bits, normals: NDArray[np.float32], lighting: CubemapLighting
 ) -> NDArray[np.float32]:
     """Unit-albedo direct transport (n, n_directions) of visibility bits, cosine and solid angle included."""
-    rows = np.empty((len(bits), lighting.n_directions), np.float32)
-    visibility = Visibility(bits, normals, lighting)
-    for a in range(0, len(rows), ROWS):
-        ids = np.arange(a, min(a + ROWS, len(rows)))
-        rows[ids] = visibility.rows(ids)[..., 0]
-    return rows
+    return Visibility(bits, normals, lighting).rows(np.arange(len(bits)))[..., 0]
 
 
 def values_at(rows: NDArray[np.float32], directions: NDArray[np.int32]) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.matrix_figures import picture_row, tonemapped
+from mi_sparse_prt.validation.matrix_figures import draw_picture, panels, picture_row, tonemapped
 from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices, reference_image
 from mi_sparse_prt.validation.validate import save_figures
 
@@ -55,13 +55,9 @@ def draw_gallery(scene: Scene, lighting: CubemapLighting, progress: bool = True)
         raise PrtError(
             f"{scene.path or 'the scene'} has no environment or no sensor: there is nothing to draw"
         )
-    if scene.diffuse:
-        return _draw(scene, precompute(scene, lighting, max_depth=MAX_DEPTH, progress=progress), progress)
-    glossy = precompute_glossy(scene, lighting, max_depth=MAX_DEPTH, progress=progress)
-    return _draw(scene, glossy, progress) | {
-        f"factors_{k}": factor_picture(factors)
-        for k, factors in enumerate(getattr(glossy.reflection, "factors", ()))
-    }
+    compute = precompute if scene.diffuse else precompute_glossy
+    transport = compute(scene, lighting, max_depth=MAX_DEPTH, progress=progress)
+    return _draw(scene, transport, progress) | factor_pictures(transport)
 
 
 def save_gallery(figures: dict[str, Figure], folder: Path, name: str) -> list[Path]:
@@ -111,6 +107,12 @@ def images_beside(images: dict[str, Floats], reference: Floats) -> Figure:
     )
 
 
+def factor_pictures(transport: LightTransport) -> dict[str, Figure]:
+    """``factors_0``, ...: of each glossy BRDF, where there are any."""
+    factors = getattr(transport.reflection, "factors", ())
+    return {f"factors_{k}": factor_picture(of_brdf) for k, of_brdf in enumerate(factors)}
+
+
 def factor_picture(factors: BrdfFactors) -> Figure:
     """Incident factors f_k above, outgoing ones g_k (mean of their channels) below; blue is negative.
 
@@ -122,14 +124,12 @@ def factor_picture(factors: BrdfFactors) -> Figure:
     z = np.sqrt(np.maximum(1 - x**2 - y**2, 1e-6))
     every = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
     rows = factors.incident, factors.outgoing.mean(axis=1)
-    figure = Figure(figsize=(2.1 * factors.terms, 4.6), layout="constrained")
-    panels = figure.subplots(2, factors.terms, squeeze=False)
-    for side, (line, tables) in enumerate(zip(panels, rows, strict=True)):
-        for k, axes in enumerate(line):
+    figure, lines = panels(2.1 * factors.terms, 4.6, 2, factors.terms)
+    for side, (line, tables) in enumerate(zip(lines, rows, strict=True)):
+        for k, axes in enumerate(np.atleast_1d(line)):
             values = factors.grid.interpolate(tables[k], every).reshape(FACTOR_SIZE, FACTOR_SIZE)
             largest = max(float(np.abs(values[inside]).max()), 1e-12)
             shown = np.where(inside, values, np.nan)
-            axes.imshow(shown, cmap="RdBu_r", vmin=-largest, vmax=largest)
-            axes.set_title(f"{'fg'[side]}{k + 1}, up to {largest:.2g}", fontsize=9)
-            axes.axis("off")
+            title = f"{'fg'[side]}{k + 1}, up to {largest:.2g}"
+            draw_picture(axes, shown, title, 9, cmap="RdBu_r", vmin=-largest, vmax=largest)
     return figure

@@ -25,7 +25,7 @@ from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.matrix_figures import picture_row, tonemapped
+from mi_sparse_prt.validation.matrix_figures import panels, picture_row, tonemapped
 from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices
 
 MAGNIFIED = 10  # differences
@@ -157,7 +157,7 @@ def method_figures(report: dict[str, Any], pictures: MethodPictures) -> dict[str
 
 def rates(report: dict[str, Any]) -> Figure:
     """Sampling rates per mesh and method, grouped as in Figure 9."""
-    figure, axes = _one_panel(10, 4)
+    figure, axes = panels(10, 4)
     bars = {
         f"{method}, {mesh}": [100 * values[rate] for rate in RATES]
         for method, found in report["methods"].items()
@@ -170,7 +170,7 @@ def rates(report: dict[str, Any]) -> Figure:
 
 def errors_times(report: dict[str, Any]) -> Figure:
     """Relative L2 of the matrix against time, a point for every method and mesh."""
-    figure, axes = _one_panel(10, 4.5)
+    figure, axes = panels(10, 4.5)
     brute = report["brute_force"]
     points = {"brute force": (brute["seconds"], brute["errors"])}
     points |= {m: (found["seconds"]["total"], found["errors"]) for m, found in report["methods"].items()}
@@ -194,7 +194,7 @@ def errors_times(report: dict[str, Any]) -> Figure:
 
 def breakdown(report: dict[str, Any]) -> Figure:
     """Time of every stage as a share of the method's own, as in Figure 12."""
-    figure, axes = _one_panel(9, 1.6 + 0.7 * len(report["methods"]))
+    figure, axes = panels(9, 1.6 + 0.7 * len(report["methods"]))
     done = dict.fromkeys(report["methods"], 0.0)
     for k, stage in enumerate(next(iter(report["methods"].values()))["stages"]):
         for method, found in report["methods"].items():
@@ -212,7 +212,7 @@ def breakdown(report: dict[str, Any]) -> Figure:
 
 def environments(report: dict[str, Any]) -> Figure:
     """Relative L2 of the relit vertices under every environment."""
-    figure, axes = _one_panel(12, 4)
+    figure, axes = panels(12, 4)
     bars = {
         f"{method}, {mesh}": {
             name: 100 * (value if name == "mean" else value["relative_l2"])
@@ -229,8 +229,7 @@ def environments(report: dict[str, Any]) -> Figure:
 
 def rotation(report: dict[str, Any]) -> Figure:
     """Error while an environment turns, and its change from frame to frame beside that of the light."""
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(13, 4.2, 1, 2)
     for k, (method, found) in enumerate(report["methods"].items()):
         turned = found["rotation"]
         styles = ("-", "--", ":", "-.") * len(turned["meshes"])
@@ -265,11 +264,6 @@ def relit_pair(pictures: MethodPictures, method: str) -> Figure:
         },
         "RdBu_r",
     )
-
-
-def _one_panel(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots()
 
 
 def _grouped(axes: Axes, groups: list[str], bars: dict[str, list[float]], form: str) -> None:

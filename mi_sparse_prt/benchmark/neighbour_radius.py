@@ -29,6 +29,7 @@ from mi_sparse_prt.sampling.spatial import SpatialSampling, choose_weighted
 from mi_sparse_prt.scene.scene import Mesh, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import diffuse_problem
+from mi_sparse_prt.validation.matrix_figures import panels
 
 PAPER = Huang2010Options()
 CURVES = {"least_squares": "least squares", "l1": "L1", "full": "full: least squares on all directions"}
@@ -149,8 +150,7 @@ def error_against_radius(
 
 def plot_error_against_radius(report: dict[str, Any]) -> Figure:
     """The three curves of ``error_against_radius``, and how many neighbours and weights they have."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(11, 4.2, 1, 2)
     for (curve, label), colour in zip(CURVES.items(), ("tab:blue", "tab:red", "tab:green"), strict=True):
         left.plot(report["radii"], 100 * np.array(report["error"][curve]), ".-", color=colour, label=label)
         right.plot(report["radii"], report["weights"][curve], ".-", color=colour, label=f"weights, {label}")

@@ -30,6 +30,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.scene.loading import load_scene
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.validation.matrix_figures import panels
 from mi_sparse_prt.validation.validate import save_figures
 
 COUNTS = (10_000, 32_000, 64_000, 128_000, 256_000, 500_000)  # vertices
@@ -222,8 +223,7 @@ def _area(scene: Scene) -> float:
 
 def size_figure(report: dict[str, Any]) -> Figure:
     """Seconds and peak memory of ``cost_against_size``: against vertices on the left, against n on the right."""
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(12, 4.6, 1, 2)
     _panel(left, report["by_vertices"], "vertices", "vertices")
     _panel(right, report["by_resolution"], "resolution", "n, of 6 n x n directions")
     figure.suptitle(f"{Path(report['scene']['path']).stem}: cost of the matrix against its size")

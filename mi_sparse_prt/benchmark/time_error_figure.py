@@ -12,6 +12,8 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from mi_sparse_prt.validation.matrix_figures import panels
+
 MARKERS, COLOURS = "sDv^<>Ph", ("C0", "C1", "C2", "C4", "C5", "C6", "C8", "C9")  # red is for "auto"
 DEVIATIONS = 2  # standard errors that bars show
 FARTHER = 1.5  # lines go on until they are this factor below the best method
@@ -58,8 +60,7 @@ def time_error_figure(report: dict[str, Any], mesh: str | None = None) -> Figure
         Solid lines were measured, dashed ones are extrapolated: error as 1 / sqrt(spp), time in proportion to it. A
         thin line to the right of a method's point ends where its own estimate of its error is done too.
     """
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = panels(12, 6)
     axes.set(xscale="log", yscale="log")
     methods, noise, bare = report["methods"], report["reference_noise"], report["bare_rays"]
     errors = [_error(point, mesh)[0] for point in methods.values()]

@@ -11,25 +11,14 @@ import typer
 from rich.table import Table
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.cli.options import (
-    DEFAULT_RESOLUTION,
-    Define,
-    EdgeLength,
-    JsonFile,
-    Method,
-    Quiet,
-    Resolution,
-    SceneFile,
-    Variant,
-    definitions,
-)
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.running import check_folder, running
 
 WITHOUT_FIGURES = ("", "--plans")
 
 Repeats = Annotated[int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")]
 Methods = Annotated[
-    list[Method] | None,
+    list[options.Method] | None,
     typer.Option(
         help="Measure time and error of a method against brute force instead; may be repeated.",
         show_default=False,
@@ -43,8 +32,7 @@ Choices = Annotated[
     ),
 ]
 TimeError = Annotated[
-    bool,
-    typer.Option("--time-error", help="Run every method instead, and compare time and error of all."),
+    bool, typer.Option("--time-error", help="Run every method instead, and compare time and error of all.")
 ]
 Plans = Annotated[
     bool,
@@ -59,26 +47,23 @@ Sizes = Annotated[
     ),
 ]
 Cpca = Annotated[
-    bool,
-    typer.Option("--cpca", help="Compare clustered PCA in two passes with the standard one instead."),
+    bool, typer.Option("--cpca", help="Compare clustered PCA in two passes with the standard one instead.")
 ]
 Glossy = Annotated[
-    bool,
-    typer.Option("--glossy", help="Measure view-dependent transport of glossy surfaces instead."),
+    bool, typer.Option("--glossy", help="Measure view-dependent transport of glossy surfaces instead.")
 ]
 Figures = Annotated[
     Path | None,
-    typer.Option(
+    options.file_option(
         metavar="FOLDER",
         help="Draw what --method, --choices, --time-error, --sizes, --cpca or --glossy measures: PNG files there.",
-        show_default=False,
     ),
 ]
 
 
 def benchmark(
-    scene: SceneFile,
-    resolution: Resolution = DEFAULT_RESOLUTION,
+    scene: options.SceneFile,
+    resolution: options.Resolution = options.DEFAULT_RESOLUTION,
     repeats: Repeats = 3,
     method: Methods = None,
     choices: Choices = False,
@@ -88,11 +73,11 @@ def benchmark(
     cpca: Cpca = False,
     glossy: Glossy = False,
     figures: Figures = None,
-    edge_length: EdgeLength = None,
-    define: Define = None,
-    variant: Variant = None,
-    json_file: JsonFile = None,
-    quiet: Quiet = False,
+    edge_length: options.EdgeLength = None,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Measure speed and memory on this machine: the direct matrix against bare rays, paths, relighting.
 
@@ -119,12 +104,12 @@ def benchmark(
     if figures is not None and which in WITHOUT_FIGURES:
         others = ", ".join(name for name in asked if name not in WITHOUT_FIGURES)
         raise typer.BadParameter(f"there are figures of {others} only", param_hint="--figures")
-    if sizes and (edge_length is not None or resolution != DEFAULT_RESOLUTION):
+    if sizes and (edge_length is not None or resolution != options.DEFAULT_RESOLUTION):
         raise typer.BadParameter("it varies --edge-length and --resolution itself", param_hint="--sizes")
     with running(json_file, quiet) as command:
         if figures is not None:
             check_folder(figures)
-        parameters, progress = definitions(define), not quiet
+        parameters, progress = options.definitions(define), not quiet
         with command.prompt_interrupts():
             measure, show = _measurement(which, repeats, method or [])
             if sizes:
@@ -147,7 +132,7 @@ def _only_one(asked: dict[str, bool]) -> str:
 
 
 def _measurement(
-    which: str, repeats: int, methods: list[Method]
+    which: str, repeats: int, methods: list[options.Method]
 ) -> tuple[Callable[..., dict[str, Any]], Callable[[dict[str, Any]], list[Table]]]:
     """What an option asks for: the function that measures it, and the tables of its report."""
     from mi_sparse_prt import benchmark as benchmarks

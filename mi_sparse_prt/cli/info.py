@@ -5,25 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 import mi_sparse_prt as prt
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.matrix_file import matrix_report
-from mi_sparse_prt.cli.options import Define, EdgeLength, JsonFile, definitions
 from mi_sparse_prt.cli.running import running
 from mi_sparse_prt.cli.tables.matrix import matrix_tables
 from mi_sparse_prt.cli.tables.scene import scene_report, scene_tables
 
-MatrixOrScene = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Matrix file, or scene (.xml).", show_default=False)
-]
+MatrixOrScene = Annotated[Path, options.file_argument("FILE", "Matrix file, or scene (.xml).")]
 
 
 def info(
     file: MatrixOrScene,
-    edge_length: EdgeLength = None,
-    define: Define = None,
-    json_file: JsonFile = None,
+    edge_length: options.EdgeLength = None,
+    define: options.Define = None,
+    json_file: options.JsonFile = None,
 ) -> None:
     """Say what a matrix holds, how it was made and how good it is, or what a scene would give.
 
@@ -33,7 +29,7 @@ def info(
     """
     with running(json_file, quiet=False) as command:
         if file.suffix.lower() == ".xml":
-            scene = prt.load_scene(file, edge_length, **definitions(define))
+            scene = prt.load_scene(file, edge_length, **options.definitions(define))
             command.report = scene_report(scene)
             command.show(*scene_tables(scene))
         else:

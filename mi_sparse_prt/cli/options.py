@@ -6,7 +6,7 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -55,12 +55,18 @@ def definitions(pairs: list[str] | None) -> dict[str, str]:
     return {name: value for name, _, value in split}
 
 
-SceneFile = Annotated[
-    Path, typer.Argument(metavar="SCENE", help="Mitsuba scene, an XML file.", show_default=False)
-]
-MatrixFile = Annotated[
-    Path, typer.Argument(metavar="MATRIX", help="Matrix file that `precompute` wrote.", show_default=False)
-]
+def file_argument(metavar: str, help: str) -> Any:
+    """A file that a command is about."""
+    return typer.Argument(metavar=metavar, help=help, show_default=False)
+
+
+def file_option(*names: str, help: str, metavar: str = "FILE") -> Any:
+    """An option whose value is a file or folder; without it there is none."""
+    return typer.Option(*names, metavar=metavar, help=help, show_default=False)
+
+
+SceneFile = Annotated[Path, file_argument("SCENE", "Mitsuba scene, an XML file.")]
+MatrixFile = Annotated[Path, file_argument("MATRIX", "Matrix file that `precompute` wrote.")]
 Define = Annotated[
     list[str] | None,
     typer.Option(

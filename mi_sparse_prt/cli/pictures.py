@@ -5,39 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 import mi_sparse_prt as prt
-from mi_sparse_prt.cli.options import (
-    DEFAULT_RESOLUTION,
-    Define,
-    EdgeLength,
-    JsonFile,
-    Quiet,
-    Resolution,
-    Variant,
-    definitions,
-)
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.running import check_folder, running
-from mi_sparse_prt.cli.tables.written import files_table
+from mi_sparse_prt.cli.tables.layout import sentences_tables
 
-SceneFiles = Annotated[
-    list[Path], typer.Argument(metavar="SCENE...", help="Mitsuba scenes, XML files.", show_default=False)
-]
+SceneFiles = Annotated[list[Path], options.file_argument("SCENE...", "Mitsuba scenes, XML files.")]
 OutputFolder = Annotated[
-    Path, typer.Option("--output", "-o", metavar="FOLDER", help="PNG files go there.", show_default=False)
+    Path, options.file_option("--output", "-o", metavar="FOLDER", help="PNG files go there.")
 ]
 
 
 def pictures(
     scenes: SceneFiles,
     output: OutputFolder,
-    resolution: Resolution = DEFAULT_RESOLUTION,
-    edge_length: EdgeLength = None,
-    define: Define = None,
-    variant: Variant = None,
-    json_file: JsonFile = None,
-    quiet: Quiet = False,
+    resolution: options.Resolution = options.DEFAULT_RESOLUTION,
+    edge_length: options.EdgeLength = None,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Draw scenes relit beside Mitsuba's path, whole and compressed, with clusters and factors of BRDFs.
 
@@ -50,9 +37,10 @@ def pictures(
 
         check_folder(output)
         for path in scenes:
-            scene = prt.load_scene(path, edge_length, **definitions(define))
+            scene = prt.load_scene(path, edge_length, **options.definitions(define))
             with command.prompt_interrupts():
                 figures = benchmarks.draw_gallery(scene, prt.CubemapLighting(resolution), progress=not quiet)
             command.written += benchmarks.save_gallery(figures, output, path.stem)
-        command.report = {"files": [str(path) for path in command.written]}
-        command.show(files_table(command.written))
+        files = [str(path) for path in command.written]
+        command.report = {"files": files}
+        command.show(*sentences_tables("Written", files))

@@ -9,20 +9,9 @@ from typing import Annotated
 import typer
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.matrix_file import matrix_report
-from mi_sparse_prt.cli.options import (
-    DEFAULT_RESOLUTION,
-    Define,
-    EdgeLength,
-    JsonFile,
-    Method,
-    Quiet,
-    Resolution,
-    SceneFile,
-    Variant,
-    definitions,
-)
-from mi_sparse_prt.cli.running import Command, check_folder, running
+from mi_sparse_prt.cli.running import check_folder, running
 from mi_sparse_prt.cli.tables.matrix import matrix_tables
 
 
@@ -34,17 +23,10 @@ class Basis(StrEnum):
 
 
 Output = Annotated[
-    Path,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="FILE",
-        help="Matrix file to write, by convention *.prt.",
-        show_default=False,
-    ),
+    Path, options.file_option("--output", "-o", help="Matrix file to write, by convention *.prt.")
 ]
 MethodOption = Annotated[
-    Method,
+    options.Method,
     typer.Option(
         help="What is quickest for the target error, by a pilot on a few hundred vertices (auto); or every "
         "element, few of them (sparse), few as in the paper (huang2010), or all direct light, and "
@@ -101,19 +83,18 @@ Strata = Annotated[
 Seed = Annotated[int, typer.Option(help="The same seed gives the same matrix.")]
 Checkpoint = Annotated[
     Path | None,
-    typer.Option(
+    options.file_option(
         metavar="FOLDER",
         help="Keep finished rows of the indirect light there: the same command after an interruption goes on.",
-        show_default=False,
     ),
 ]
 
 
 def precompute(
-    scene: SceneFile,
+    scene: options.SceneFile,
     output: Output,
-    resolution: Resolution = DEFAULT_RESOLUTION,
-    method: MethodOption = Method.auto,
+    resolution: options.Resolution = options.DEFAULT_RESOLUTION,
+    method: MethodOption = options.Method.auto,
     basis: BasisOption = Basis.direction,
     max_depth: MaxDepth = 5,
     spp: Samples = None,
@@ -122,13 +103,13 @@ def precompute(
     terms: Terms = None,
     explain: Explain = False,
     strata: Strata = 2,
-    edge_length: EdgeLength = None,
+    edge_length: options.EdgeLength = None,
     seed: Seed = 0,
     checkpoint: Checkpoint = None,
-    define: Define = None,
-    variant: Variant = None,
-    json_file: JsonFile = None,
-    quiet: Quiet = False,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Compute the light transport matrix of a scene and write it to a file.
 
@@ -137,13 +118,14 @@ def precompute(
     A forecast of time and memory comes first; a table of what was done, skipped and how good it is comes last.
     Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain. Glossy surfaces: add --terms 4.
     """
-    if indirect_resolution is None and method is Method.brute_force and target_error is None:
+    if indirect_resolution is None and method is options.Method.brute_force and target_error is None:
         indirect_resolution = min(8, resolution)
     with running(json_file, quiet, outputs=[output]) as command:
-        parameters = definitions(define)
+        parameters = options.definitions(define)
         loaded = prt.load_scene(scene, edge_length, **parameters)
         if checkpoint is not None:
-            _keep_rows_in(command, checkpoint)
+            check_folder(checkpoint)
+            command.hint = f"; finished rows are in {checkpoint}, the same command goes on with them"
         with command.prompt_interrupts():
             transport = prt.precompute(
                 loaded,
@@ -160,31 +142,13 @@ def precompute(
                 checkpoint_folder=checkpoint,
                 terms=terms or 0,
             )
-        _record_scene(transport, scene, parameters, edge_length)
-        _save(command, transport, output)
+        # what `relight` needs to load the same scene again
+        transport.report["scene"] |= {
+            "path": str(scene.absolute()),
+            "parameters": parameters,
+            "edge_length": None if edge_length is None else str(edge_length),
+        }
+        transport.save(output)
+        command.written.append(output)
+        command.report = matrix_report(transport, output)
         command.show(*matrix_tables(transport, output, explain))
-
-
-def _keep_rows_in(command: Command, folder: Path) -> None:
-    check_folder(folder)
-    command.hint = f"; finished rows are in {folder}, the same command goes on with them"
-
-
-def _record_scene(
-    transport: prt.LightTransport,
-    path: Path,
-    parameters: dict[str, str],
-    edge_length: float | None,
-) -> None:
-    """Write into the report what `relight` needs to load the same scene again."""
-    transport.report["scene"] |= {
-        "path": str(path.absolute()),
-        "parameters": parameters,
-        "edge_length": None if edge_length is None else str(edge_length),
-    }
-
-
-def _save(command: Command, transport: prt.LightTransport, path: Path) -> None:
-    transport.save(path)
-    command.written.append(path)
-    command.report = matrix_report(transport, path)

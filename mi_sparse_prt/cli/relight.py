@@ -7,39 +7,24 @@ from typing import Annotated, Any
 
 import typer
 
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.matrix_file import with_scene
-from mi_sparse_prt.cli.options import Define, JsonFile, MatrixFile, Quiet, Variant, definitions
 from mi_sparse_prt.cli.running import running
 from mi_sparse_prt.cli.tables.written import relighting_table
 from mi_sparse_prt.core.errors import PrtError
 
 EnvironmentFile = Annotated[
     Path,
-    typer.Option(
-        "--environment",
-        "-e",
-        metavar="ENV",
-        help="Equirectangular HDR image: .exr, .hdr or .pfm.",
-        show_default=False,
+    options.file_option(
+        "--environment", "-e", metavar="ENV", help="Equirectangular HDR image: .exr, .hdr or .pfm."
     ),
 ]
 ImageFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="FILE",
-        help="Image to write: .png (sRGB) or .exr (linear).",
-        show_default=False,
-    ),
+    Path | None, options.file_option("--output", "-o", help="Image to write: .png (sRGB) or .exr (linear).")
 ]
 VerticesFile = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Radiance of the vertices: .npy (n_v, 3), or .ply with linear colours.",
-        show_default=False,
-    ),
+    options.file_option(help="Radiance of the vertices: .npy (n_v, 3), or .ply with linear colours."),
 ]
 Rotate = Annotated[float, typer.Option(metavar="DEGREES", help="Turn the environment about +y, the up axis.")]
 Exposure = Annotated[float, typer.Option(metavar="STOPS", help="Brighten a .png by this power of two.")]
@@ -56,7 +41,7 @@ MatrixScene = Annotated[
 
 
 def relight(
-    matrix: MatrixFile,
+    matrix: options.MatrixFile,
     environment: EnvironmentFile,
     output: ImageFile = None,
     vertices: VerticesFile = None,
@@ -65,10 +50,10 @@ def relight(
     sensor: Sensor = 0,
     spp: Samples = 64,
     scene: MatrixScene = None,
-    define: Define = None,
-    variant: Variant = None,
-    json_file: JsonFile = None,
-    quiet: Quiet = False,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Light a scene with an environment through its matrix, and write the camera's image.
 
@@ -90,7 +75,9 @@ def relight(
         with command.prompt_interrupts():
             with clock.phase("load"):
                 light = load_environment(environment).rotated(rotate)
-                loaded, transport = with_scene(load_transport(matrix), matrix, scene, definitions(define))
+                loaded, transport = with_scene(
+                    load_transport(matrix), matrix, scene, options.definitions(define)
+                )
             report["environment"] = light.report
             if vertices is not None and transport.terms:
                 raise PrtError(

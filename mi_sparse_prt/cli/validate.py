@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.matrix_file import with_scene
-from mi_sparse_prt.cli.options import Define, JsonFile, MatrixFile, Quiet, SceneFile, Variant, definitions
 from mi_sparse_prt.cli.running import check_folder, running
 
 Rows = Annotated[int, typer.Option(help="Vertices to compare at, drawn from every mesh.")]
@@ -19,25 +19,23 @@ ImageSamples = Annotated[int, typer.Option(help="Samples per pixel of the image'
 Seed = Annotated[int, typer.Option(help="Of the choice of elements and of the render.")]
 OutputFolder = Annotated[
     Path | None,
-    typer.Option(
-        "--output", "-o", metavar="FOLDER", help="Write pictures and report.json there.", show_default=False
-    ),
+    options.file_option("--output", "-o", metavar="FOLDER", help="Write pictures and report.json there."),
 ]
 
 
 def validate(
-    scene: SceneFile,
-    matrix: MatrixFile,
+    scene: options.SceneFile,
+    matrix: options.MatrixFile,
     rows: Rows = 64,
     columns: Columns = 256,
     spp: Samples = 1024,
     image_spp: ImageSamples = 256,
     seed: Seed = 0,
     output: OutputFolder = None,
-    define: Define = None,
-    variant: Variant = None,
-    json_file: JsonFile = None,
-    quiet: Quiet = False,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Compare a matrix with Mitsuba's own render of it, and a relit image with Mitsuba's path.
 
@@ -53,7 +51,7 @@ def validate(
 
         if output is not None:
             check_folder(output)
-        loaded, transport = with_scene(prt.load_transport(matrix), matrix, scene, definitions(define))
+        loaded, transport = with_scene(prt.load_transport(matrix), matrix, scene, options.definitions(define))
         result: prt.Validation | GlossyValidation
         with command.prompt_interrupts():
             if transport.terms:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.metrics import relative_l2
@@ -25,17 +28,21 @@ def unfolded(texels: NDArray[np.floating], lighting: CubemapLighting) -> NDArray
     return picture
 
 
+def panels(width: float, height: float, *shape: int) -> tuple[Figure, Any]:
+    """A figure (inches) and its axes: an array of them if there are several, rows and columns being ``shape``."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(*shape)
+
+
 def rows(
     values: NDArray[np.floating], lighting: CubemapLighting, vertices: NDArray[np.integer], count: int = 4
 ) -> Figure:
     """A few rows of T as unfolded cubemaps: where each vertex gets its light from."""
     chosen = np.linspace(0, len(vertices) - 1, min(count, len(vertices))).astype(int)
-    figure = Figure(figsize=(4 * len(chosen), 3.4), layout="constrained")
-    for axes, k in zip(np.atleast_1d(figure.subplots(1, len(chosen))), chosen, strict=True):
+    figure, every = panels(4 * len(chosen), 3.4, 1, len(chosen))
+    for axes, k in zip(np.atleast_1d(every), chosen, strict=True):
         density = values[k].mean(axis=1) / lighting.solid_angles
-        image = axes.imshow(unfolded(density, lighting), cmap="magma")
-        axes.set_title(f"vertex {vertices[k]}")
-        axes.axis("off")
+        image = draw_picture(axes, unfolded(density, lighting), f"vertex {vertices[k]}", cmap="magma")
         figure.colorbar(image, ax=axes, shrink=0.7, label="T / solid angle (1/sr)")
     return figure
 
@@ -47,8 +54,7 @@ def errors(
     meshes: tuple[MeshRange, ...],
 ) -> Figure:
     """Relative L2 difference of every row, noise of the reference included, and element against element."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(11, 4.2, 1, 2)
     relative = relative_l2(ours, reference, axis=(1, 2))
     for mesh in meshes:
         inside = (vertices >= mesh.vertices.start) & (vertices < mesh.vertices.stop)
@@ -82,13 +88,19 @@ def images(
 
 def picture_row(pictures: Mapping[str, NDArray[np.floating]], cmap: str = "viridis") -> Figure:
     """Pictures (height, width, 3), or numbers (height, width) as colours, in [0, 1], side by side with their titles."""
-    figure = Figure(figsize=(max(7, 5 * len(pictures)), 4.2), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(pictures)))
-    for axes, (title, picture) in zip(panels, pictures.items(), strict=True):
-        axes.imshow(np.clip(picture, 0, 1), vmin=0, vmax=1, cmap=cmap)
-        axes.set_title(title)
-        axes.axis("off")
+    figure, every = panels(max(7, 5 * len(pictures)), 4.2, 1, len(pictures))
+    for axes, (title, picture) in zip(np.atleast_1d(every), pictures.items(), strict=True):
+        draw_picture(axes, np.clip(picture, 0, 1), title, vmin=0, vmax=1, cmap=cmap)
     return figure
+
+
+def draw_picture(
+    axes: Axes, picture: NDArray[np.floating], title: str, size: float | str = "large", **options: Any
+) -> AxesImage:
+    """A picture under its title, of a size in points or in matplotlib's words, without axes."""
+    axes.set_title(title, fontsize=size)
+    axes.axis("off")
+    return axes.imshow(picture, **options)
 
 
 def tonemapped(image: NDArray[np.floating], brightest: float | None = None) -> NDArray[np.floating]:

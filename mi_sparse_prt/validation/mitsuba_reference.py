@@ -130,7 +130,14 @@ def reference_image(
 ) -> NDArray[np.float32]:
     """Mitsuba's ``path`` image (height, width, 3) of a scene's meshes under one environment emitter, world units."""
     lit = lit_scene(scene.unlit_shapes(), background)
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+    return path_image(lit, sensor, max_depth, spp, seed)
+
+
+def path_image(
+    lit: mi.Scene, sensor: mi.Sensor, max_depth: int, spp: int, seed: int, **options: Any
+) -> NDArray[np.float32]:
+    """Mitsuba's ``path`` image (height, width, 3) of a scene, with options of that integrator."""
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, **options})
     return np.array(mi.render(lit, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from mi_sparse_prt.cli.tables.layout import new_table, percent
+from mi_sparse_prt.cli.tables.layout import new_table, percent, words
 
 
 def choices_tables(report: dict[str, Any]) -> list[Table]:
@@ -20,19 +20,16 @@ def choices_tables(report: dict[str, Any]) -> list[Table]:
 
 def _choices_table(mesh: str, choices: dict[str, Any]) -> Table:
     title = f"{mesh}: {choices['row_share']:.0%} of rows, up to {choices['column_share']:.0%} of columns"
-    table = new_table(title, "", "relative L2", "directions used")
-    for name, error in choices["error"].items():
-        table.add_row(
-            name.replace("_", " "),
-            f"{error:.2%} +- {choices['standard_error'][name]:.2%}",
-            percent(choices["directions"].get(name, 0.0)),
-        )
-    return table
+    spread, used = choices["standard_error"], choices["directions"]
+    rows = (
+        (words(name), f"{error:.2%} +- {spread[name]:.2%}", percent(used.get(name, 0.0)))
+        for name, error in choices["error"].items()
+    )
+    return new_table(title, ("", "relative L2", "directions used"), rows)
 
 
 def _radius_table(mesh: str, found: dict[str, Any]) -> Table:
-    table = new_table(f"{mesh}: error and radius", "radius", *(f"{radius:g}" for radius in found["radii"]))
-    table.add_row("neighbours", *(f"{count:.0f}" for count in found["neighbours"]))
-    for name, errors in found["error"].items():
-        table.add_row(name.replace("_", " "), *(percent(error) for error in errors))
-    return table
+    columns = ("radius", *(f"{radius:g}" for radius in found["radii"]))
+    neighbours = ("neighbours", *(f"{count:.0f}" for count in found["neighbours"]))
+    errors = ((words(name), *map(percent, errors)) for name, errors in found["error"].items())
+    return new_table(f"{mesh}: error and radius", columns, [neighbours, *errors])

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.table import Table
 
+Row = Sequence[str]
 
-def new_table(title: str, *columns: str) -> Table:
-    """A table whose first column is text, the others numbers."""
+FACTS = ("", "")  # columns of a table of facts: what it is, and how much; no header
+
+
+def new_table(title: str, columns: Row, *sections: Iterable[Row]) -> Table:
+    """A table whose first column is text, the others numbers, with a line between its sections."""
     table = Table(title=title, title_justify="left", show_header=any(columns))
     for k, column in enumerate(columns):
         table.add_column(column, justify="left" if k == 0 else "right", overflow="fold")
+    for section in sections:
+        table.add_section()
+        for row in section:
+            table.add_row(*row)
     return table
 
 
 def sentences_tables(title: str, sentences: list[str]) -> list[Table]:
     """A table with a sentence in each row; without any, none."""
-    table = new_table(title, "")
-    for sentence in sentences:
-        table.add_row(sentence)
-    return [table] if sentences else []
+    return [new_table(title, [""], [[sentence] for sentence in sentences])] if sentences else []
 
 
 def plan_words(plan: dict[str, Any]) -> str:
@@ -29,6 +35,16 @@ def plan_words(plan: dict[str, Any]) -> str:
         f"{name} {value}" for name, value in plan["parameters"].items() if value is not None
     )
     return f"{plan['direct']}, {plan['indirect']} {parameters}".strip()
+
+
+def words(key: str) -> str:
+    """A key of a report as it is said."""
+    return key.replace("_", " ")
+
+
+def listed(numbers: dict[str, str]) -> str:
+    """Names with their values, in one line."""
+    return ", ".join(f"{name} {value}" for name, value in numbers.items())
 
 
 def percent(share: float) -> str:

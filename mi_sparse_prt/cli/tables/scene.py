@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.cli.tables.layout import byte_count, new_table, sentences_tables
+from mi_sparse_prt.cli.tables.layout import FACTS, byte_count, new_table, sentences_tables
 
 
 def scene_report(scene: prt.Scene) -> dict[str, Any]:
@@ -33,20 +33,22 @@ def scene_report(scene: prt.Scene) -> dict[str, Any]:
 def scene_tables(scene: prt.Scene) -> list[Table]:
     """What a scene consists of, and what its matrix would take."""
     report = scene_report(scene)
-    meshes = new_table(
-        f"{scene.path}: {report['vertices']:,} vertices", "mesh", "vertices", "triangles", "mean albedo"
-    )
+    meshes = []
     for mesh in scene.meshes:
         sizes = report["meshes"][mesh.name]
         albedo = " ".join(f"{value:.3f}" for value in scene.albedo[mesh.vertices].mean(axis=0))
-        meshes.add_row(mesh.name, f"{sizes['vertices']:,}", f"{sizes['triangles']:,}", albedo)
-    facts = new_table("Scene", "", "")
-    low, high = report["box"]
-    facts.add_row(
-        "box", " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (low, high))
-    )
-    facts.add_row("grey, so one channel of indirect light", "yes" if scene.grey else "no")
-    facts.add_row("diffuse only", "yes" if scene.diffuse else "no")
-    facts.add_row("direct matrix, 6 x 32 x 32 directions", byte_count(report["vertices"] * 6144 // 8))
-    facts.add_row("hash", scene.hash)
-    return [meshes, facts, *sentences_tables("Warnings", scene.warnings)]
+        meshes.append((mesh.name, f"{sizes['vertices']:,}", f"{sizes['triangles']:,}", albedo))
+    corners = ("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in report["box"])
+    facts = [
+        ("box", " to ".join(corners)),
+        ("grey, so one channel of indirect light", "yes" if scene.grey else "no"),
+        ("diffuse only", "yes" if scene.diffuse else "no"),
+        ("direct matrix, 6 x 32 x 32 directions", byte_count(report["vertices"] * 6144 // 8)),
+        ("hash", scene.hash),
+    ]
+    title = f"{scene.path}: {report['vertices']:,} vertices"
+    return [
+        new_table(title, ("mesh", "vertices", "triangles", "mean albedo"), meshes),
+        new_table("Scene", FACTS, facts),
+        *sentences_tables("Warnings", scene.warnings),
+    ]
