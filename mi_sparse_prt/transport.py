@@ -48,13 +48,13 @@ class Coefficients:
 
     Attributes
     ----------
-    white : (n, 3) float32
+    unit_albedo : (n, 3) float32
         Irradiance / pi of each point.
     terms : (n, K, 3) float32
         B_k; zeros at points that are not glossy.
     """
 
-    white: Floats
+    unit_albedo: Floats
     terms: Floats
 
 
@@ -186,7 +186,7 @@ class LightTransport:
         return self.measurement.combined(self.reflection.radiosity(self.incident.columns(chosen)))
 
     def irradiance(self, lighting: Any) -> Floats:
-        """What leaves the points if they were white: irradiance / pi, (n, 3) float32 (see ``relight``)."""
+        """What would leave points of albedo 1: irradiance / pi, (n, 3) float32 (see ``relight``)."""
         return self._incident_light(lighting)[: len(self.measurement)]
 
     def relight(self, lighting: Any, outgoing: ArrayLike | None = None) -> Floats:
@@ -230,7 +230,7 @@ class LightTransport:
 
     def adjoint(self, y: Floats) -> Floats:
         """Products of the transpose: (n, 3, k) to (n_directions, 3, k)."""
-        outgoing = self.measurement.spread(np.asarray(y, np.float32))
+        outgoing = self.measurement.combined_adjoint(np.asarray(y, np.float32))
         return self.incident.adjoint(self.reflection.radiosity_adjoint(outgoing))
 
     def to_xarray(self, ids: ArrayLike | None = None) -> DataArray:

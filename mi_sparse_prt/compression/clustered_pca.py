@@ -93,8 +93,8 @@ class SphereRows:
         per_item = self.items.rows.shape[1]
         for a in range(0, len(ids), EXPANDED):
             some = ids[a : a + EXPANDED]
-            white = self._incident.rows(self.items.rows[some].ravel())  # [row, direction, channel]
-            by_channel = np.moveaxis(white, 2, 1).reshape(len(some), per_item, -1, len(self.scale))
+            unit_albedo = self._incident.rows(self.items.rows[some].ravel())  # [row, direction, channel]
+            by_channel = np.moveaxis(unit_albedo, 2, 1).reshape(len(some), per_item, -1, len(self.scale))
             into = result[a : a + EXPANDED].reshape(by_channel.shape)
             np.multiply(by_channel, self._inverse, out=into)
         return result
@@ -183,10 +183,10 @@ def clustered_mesh(
     coordinates = rows.coordinates(span)
     dense = rows.sample(max(-(-len(rows) // DENSE), min(len(rows), clusters * bases)))
     found = two_pass_cpca(coordinates, rows.weights, dense, clusters, bases, centred, seed)
-    return finished(rows, found, coordinates, centred)
+    return finalise(rows, found, coordinates, centred)
 
 
-def finished(rows: SphereRows, found: Clusters, coordinates: Floats, centred: bool = True) -> MeshClusters:
+def finalise(rows: SphereRows, found: Clusters, coordinates: Floats, centred: bool = True) -> MeshClusters:
     """Spaces made of the rows themselves, coefficients of all rows, and their errors; all rounded to 16 bits.
 
     Parameters

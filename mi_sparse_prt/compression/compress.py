@@ -38,7 +38,7 @@ def compress(
     Parameters
     ----------
     transport : LightTransport
-        Rows of a glossy vertex, white light and terms, share its cluster ([Leh07] 3.3).
+        Rows of a glossy vertex, unit-albedo light and terms, share its cluster ([Leh07] 3.3).
     method : {"cpca", "haar"}
         Clustered principal components, per mesh ([SHHS03], [HR10] 6), or the largest Haar wavelet coefficients of each
         row ([NRH03]), which knows neither ``clusters`` nor ``bases`` nor ``seed``.

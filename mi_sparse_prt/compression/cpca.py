@@ -82,15 +82,15 @@ def standard_cpca(
     Clusters
         None is empty.
     """
-    found, compared = seeded(rows, weights, clusters, centred, seed), 0
+    found, compared = seed_clusters(rows, weights, clusters, centred, seed), 0
     for b in range(bases + 1):
         for repeat in range(ITERATIONS if 0 < b < bases else SETTLING):
             if exhaustive or (repeat == 0 and b % COMPARED == 0) or compared != len(found):
                 nearest = nearest_clusters(rows, found, 1 if exhaustive else CANDIDATES)
                 labels, compared = nearest[:, 0], len(found)
             else:
-                labels = reassigned(rows, found, nearest)
-            found = fitted(rows, weights, found.with_labels(labels), b, centred)
+                labels = reassign(rows, found, nearest)
+            found = fit_spaces(rows, weights, found.with_labels(labels), b, centred)
     return found
 
 
@@ -120,10 +120,10 @@ def two_pass_cpca(
         Of all items.
     """
     found = standard_cpca(rows[dense], weights[dense], clusters, bases, centred, seed, exhaustive=False)
-    return settled(rows, weights, found, bases, centred)
+    return lloyd_refine(rows, weights, found, bases, centred)
 
 
-def settled(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
+def lloyd_refine(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
     """All items (n, g, m) in their nearest clusters, which follow, a few times; no basis vectors are added."""
     found, compared = clusters, 0
     for _ in range(SETTLING):
@@ -131,12 +131,12 @@ def settled(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centr
             nearest = nearest_clusters(rows, found, CANDIDATES)
             labels, compared = nearest[:, 0], len(found)
         else:
-            labels = reassigned(rows, found, nearest)
-        found = fitted(rows, weights, found.with_labels(labels), bases, centred)
+            labels = reassign(rows, found, nearest)
+        found = fit_spaces(rows, weights, found.with_labels(labels), bases, centred)
     return found
 
 
-def seeded(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: int) -> Clusters:
+def seed_clusters(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: int) -> Clusters:
     """Clusters without basis vectors, around items that are far from each other (k-means++)."""
     rng = np.random.default_rng(seed)
     flat = rows.reshape(len(rows), -1)
@@ -156,7 +156,7 @@ def seeded(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: in
     return Clusters(np.zeros(len(rows), np.int64), centres, empty)
 
 
-def fitted(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
+def fit_spaces(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
     """Means and principal components of clusters whose labels are given; the old ones are where the search begins.
 
     Empty clusters are given the items that are farthest from theirs, as long as these have any error, and disappear
@@ -365,7 +365,7 @@ def _closest(products: Floats, offsets: Floats, nearest: Indices) -> None:
                 nearest[i, place] = c
 
 
-def reassigned(rows: Floats, clusters: Clusters, candidates: Indices) -> Indices:
+def reassign(rows: Floats, clusters: Clusters, candidates: Indices) -> Indices:
     """The nearest of each item's candidates (n, any): labels (n,)."""
     squares = squared_distances(rows, clusters, candidates)
     return np.take_along_axis(candidates, squares.argmin(axis=1)[:, None], axis=1)[:, 0]

@@ -126,7 +126,7 @@ class Measurement:
         flat = self.weights @ values.reshape(len(values), -1)
         return flat.reshape(-1, *values.shape[1:])
 
-    def spread(self, values: Floats) -> Floats:
+    def combined_adjoint(self, values: Floats) -> Floats:
         """The transpose of ``combined``: (outputs, ...) to (n, ...)."""
         if self.weights is None:
             return values

@@ -56,8 +56,8 @@ class HaarRows(Operator):
         values = some.values * np.repeat(some.scales.ravel(), np.diff(some.starts))
         lists = (values, some.places.astype(np.int32), some.starts)
         coefficients = scipy.sparse.csr_array(lists, shape=(some.scales.size, m)).toarray()
-        white = inverse_haar(coefficients) * self._scale()
-        return np.ascontiguousarray(np.moveaxis(white.reshape(*some.scales.shape, m), 1, 2))
+        unit_albedo = inverse_haar(coefficients) * self._scale()
+        return np.ascontiguousarray(np.moveaxis(unit_albedo.reshape(*some.scales.shape, m), 1, 2))
 
     def columns(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)

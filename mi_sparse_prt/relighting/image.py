@@ -126,7 +126,7 @@ class GlossyRelitScene(RelitScene):
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients(environment), transport.reflection
         assert isinstance(surfaces, InOutFactors)
-        super().__init__(scene, found.white, background)
+        super().__init__(scene, found.unit_albedo, background)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))

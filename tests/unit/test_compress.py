@@ -10,9 +10,9 @@ from conftest import altered, made_up
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.compression import clustered_pca
-from mi_sparse_prt.compression.clustered_pca import finished, mesh_rows
+from mi_sparse_prt.compression.clustered_pca import finalise, mesh_rows
 from mi_sparse_prt.compression.compress import matrix_errors
-from mi_sparse_prt.compression.cpca import Clusters, settled, standard_cpca
+from mi_sparse_prt.compression.cpca import Clusters, lloyd_refine, standard_cpca
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.scene.scene import Scene
@@ -79,11 +79,11 @@ def test_factors_give_the_clusters_of_the_expanded_matrix() -> None:
     np.testing.assert_allclose(coordinates @ span, explicit, atol=1e-4)
     start = standard_cpca(explicit, rows.weights, 4, 5)
     lifted = Clusters(start.labels, start.means @ span.T, start.bases @ span.T)
-    one = settled(explicit, rows.weights, start, 5, True)
-    other = settled(coordinates, rows.weights, lifted, 5, True)
+    one = lloyd_refine(explicit, rows.weights, start, 5, True)
+    other = lloyd_refine(coordinates, rows.weights, lifted, 5, True)
     np.testing.assert_array_equal(one.labels, other.labels)
     errors = [
-        finished(rows, found, values).left[-1] for found, values in ((other, coordinates), (one, explicit))
+        finalise(rows, found, values).left[-1] for found, values in ((other, coordinates), (one, explicit))
     ]
     energy = (rows.weights * np.square(explicit).sum(axis=(1, 2))).sum()
     assert abs(np.sqrt(errors[0] / energy) - np.sqrt(errors[1] / energy)) < 1e-4

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from mi_sparse_prt.compression.cpca import (
     Clusters,
     affine_space,
-    fitted,
+    fit_spaces,
+    lloyd_refine,
     nearest_clusters,
     random_mixtures,
-    reassigned,
+    reassign,
     refined_space,
-    seeded,
-    settled,
+    seed_clusters,
     squared_distances,
     standard_cpca,
     two_pass_cpca,
@@ -113,11 +113,13 @@ def test_rows_of_few_dimensions_have_no_more_components(rank: int) -> None:
 
 def test_nearest_clusters_are_those_of_all_distances() -> None:
     rows, labels = spaces(400, 6, 4, 30, noise=0.5, g=2)
-    found = fitted(rows, equal(400), seeded(rows, equal(400), 6, True, 0).with_labels(labels), 4, True)
+    found = fit_spaces(
+        rows, equal(400), seed_clusters(rows, equal(400), 6, True, 0).with_labels(labels), 4, True
+    )
     away = distances(rows, found)
     nearest = nearest_clusters(rows, found, 3)
     np.testing.assert_array_equal(nearest, np.argsort(away, axis=1)[:, :3])
-    np.testing.assert_array_equal(reassigned(rows, found, nearest), away.argmin(axis=1))
+    np.testing.assert_array_equal(reassign(rows, found, nearest), away.argmin(axis=1))
     np.testing.assert_allclose(
         squared_distances(rows, found, nearest), np.take_along_axis(away, nearest, 1), rtol=1e-3
     )
@@ -128,7 +130,7 @@ def test_more_iterations_never_make_it_worse(centred: bool) -> None:
     rows, _ = spaces(500, 6, 6, 50, noise=0.3)
     found = standard_cpca(rows, equal(500), 6, 4, centred)
     before = total(rows, equal(500), found)
-    assert total(rows, equal(500), settled(rows, equal(500), found, 4, centred)) <= before * (1 + 1e-4)
+    assert total(rows, equal(500), lloyd_refine(rows, equal(500), found, 4, centred)) <= before * (1 + 1e-4)
 
 
 @pytest.mark.parametrize("centred", [True, False])
@@ -146,8 +148,8 @@ def test_the_factored_form_is_the_explicit_one(centred: bool) -> None:
     lifted = Clusters(
         start.labels, (start.means @ span.T).astype(np.float32), (start.bases @ span.T).astype(np.float32)
     )
-    one = settled(explicit[:, None], weights, start, 6, centred)
-    other = settled(factored[:, None], weights, lifted, 6, centred)
+    one = lloyd_refine(explicit[:, None], weights, start, 6, centred)
+    other = lloyd_refine(factored[:, None], weights, lifted, 6, centred)
     assert (one.labels == other.labels).mean() > 0.995  # ties
     errors = [relative(r[:, None], weights, c) for r, c in ((explicit, one), (factored, other))]
     assert abs(errors[0] - errors[1]) < 1e-4
@@ -181,8 +183,8 @@ def test_weights_are_those_of_squared_errors() -> None:
 
 def test_clusters_that_become_empty_are_given_the_farthest_items() -> None:
     rows, labels = spaces(300, 3, 0, 10, noise=0.1)
-    start = seeded(rows, equal(300), 6, True, 0)
-    found = fitted(rows, equal(300), start.with_labels(np.zeros(300, np.int64)), 0, True)
+    start = seed_clusters(rows, equal(300), 6, True, 0)
+    found = fit_spaces(rows, equal(300), start.with_labels(np.zeros(300, np.int64)), 0, True)
     assert len(found) == 6
     assert np.bincount(found.labels, minlength=6).min() >= 1
 

@@ -90,7 +90,7 @@ def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: LightTransport) ->
     rows = every_row(glossy)
     found = glossy.coefficients(light)
     b = np.einsum("ijc,jd->id", rows, light)  # grey: one channel
-    np.testing.assert_allclose(found.white, b[: scene.n_vertices], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found.unit_albedo, b[: scene.n_vertices], rtol=1e-3, atol=1e-5)
     terms = b[scene.n_vertices :].reshape(-1, 3, 3)
     np.testing.assert_allclose(found.terms[glossy.reflection.glossy], terms, rtol=1e-3, atol=1e-5)
     up = np.array([0.0, 1.0, 0.0])
@@ -100,7 +100,7 @@ def test_relighting_is_a_sum_over_terms(scene: Scene, glossy: LightTransport) ->
     local = (frames(reflection.tangents, reflection.normals)[v] @ up).astype(np.float32)
     factors = reflection.factors[0]
     g = factors.grid.interpolate(factors.outgoing, local[None])[:, 0, 0]
-    expected = glossy.albedo[v] * found.white[v] + g @ found.terms[v]
+    expected = glossy.albedo[v] * found.unit_albedo[v] + g @ found.terms[v]
     np.testing.assert_allclose(radiance[v], expected, rtol=1e-4)
     assert not radiance[scene.normals[:, 1] < -0.01].any()
 

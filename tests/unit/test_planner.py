@@ -33,7 +33,7 @@ from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.first_bounce import MOST
+from mi_sparse_prt.solvers.first_bounce import USUAL
 
 LIGHTING = prt.CubemapLighting(4)
 EXACT = {"exact": DirectCost(10.0, 0.0)}
@@ -206,7 +206,7 @@ def test_a_rank_grows_as_it_did_within_the_sample():
     assert rank(20, 40) == pytest.approx(40 * 2**3)
     assert rank(20, 40, directions=96) == 96
     assert rank(20, 40, vertices=100) == 100
-    assert rank(100, 200) == MOST
+    assert rank(100, 200) == USUAL.most
 
 
 def test_what_may_miss_the_target_costs_more():

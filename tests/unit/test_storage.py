@@ -249,7 +249,7 @@ def test_files_of_version_6(number):
 def test_glossy_files_of_version_6(name, key):
     loaded, known = prt.load_transport(DATA / f"version_6_{name}.prt"), np.load(DATA / "version_6.npz")
     found = loaded.coefficients(known["light"])
-    np.testing.assert_allclose(found.white, known[f"{key}_white"], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found.unit_albedo, known[f"{key}_white"], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found.terms, known[f"{key}_terms"], rtol=1e-4, atol=1e-5)
     if name == "glossy":
         towards = loaded.relight(known["light"], [0.1, 0.9, 0.3])

@@ -288,7 +288,7 @@ def test_a_view(glossy):
     assert above.any() and not above.all()
     assert not found[~above].any()
     for i in np.flatnonzero(above):
-        known = surfaces.albedo[i] * coefficients.white[i]
+        known = surfaces.albedo[i] * coefficients.unit_albedo[i]
         if surfaces.material[i] >= 0:
             f = surfaces.factors[surfaces.material[i]]
             turn = frames(surfaces.tangents[i : i + 1], surfaces.normals[i : i + 1])[0]
@@ -316,13 +316,13 @@ def test_coefficients_of_a_glossy_matrix(glossy):
     rows = glossy.incident.rows(np.arange(surfaces.row_count)).astype(np.float64)
     products = np.einsum("rmc,mc->rc", np.broadcast_to(rows, (len(rows), M, 3)), light)
     found = glossy.coefficients(light)
-    assert close(found.white, products[:N_V])
+    assert close(found.unit_albedo, products[:N_V])
     for i in range(N_V):
         own = surfaces.rows_of(np.array([i]))
         assert own[0] == i
         terms = products[own[1:]] if surfaces.material[i] >= 0 else np.zeros((TERMS, 3))
         assert np.allclose(found.terms[i], terms, rtol=1e-4, atol=1e-4 * np.abs(products).max())
-    assert np.array_equal(glossy.irradiance(light), found.white)
+    assert np.array_equal(glossy.irradiance(light), found.unit_albedo)
 
 
 # ------------------------------------------------------------------------------------ files
