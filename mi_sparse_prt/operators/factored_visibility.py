@@ -108,6 +108,20 @@ class FactoredVisibility(Operator):
     def columns(self, ids: Ids) -> Floats:
         return np.concatenate([self.visibility.columns(ids), self._term_columns(ids)[..., None]])
 
+    def elements(self, ids: Ids, texels: Ids) -> Floats:
+        ids, texels = np.asarray(ids), np.asarray(texels)
+        result = np.empty((len(ids), 1), np.float32)
+        diffuse = ids < len(self.material)
+        result[diffuse] = self.visibility.elements(ids[diffuse], texels[diffuse])
+        which, term = np.divmod(ids[~diffuse] - len(self.material), self.terms)
+        asked = texels[~diffuse].astype(np.int64)
+        directions, power = self.lighting.directions[asked], self.lighting.solid_angles[asked]
+        vertices, own_frames, materials, tables = self._points(which)
+        arguments: Any = (*self._seen, vertices, own_frames, materials, tables)
+        places: Any = asked, directions, power.astype(np.float32), term
+        result[~diffuse, 0] = _single(*arguments, *places)
+        return result
+
     def dense_columns(self, texels: Ids, out: Floats) -> Floats:
         n = len(self.material)
         diffuse = self.visibility.dense_columns(texels, out[:n])
@@ -310,6 +324,38 @@ def _expanded(
             _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
             for k in range(terms):
                 result[i, k, j] = value[0, k]
+    return result
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _single(
+    bits: NDArray[np.uint32],
+    starts: NDArray[np.int64],
+    listed: NDArray[np.unsignedinteger],
+    shares: NDArray[np.uint8],
+    vertices: NDArray[np.int64],
+    frames: Floats,
+    materials: NDArray[np.int64],
+    tables: Floats,
+    texels: NDArray[np.int64],
+    directions: Floats,
+    power: Floats,
+    term: NDArray[np.int64],
+) -> Floats:
+    """One term (m,) at one texel each, whose directions are (m, 3)."""
+    result = np.zeros(len(vertices), np.float32)
+    for i in numba.prange(len(vertices)):
+        weight = power[i] * np.float32(bit_of(bits[vertices[i]], texels[i]))
+        first, last = starts[vertices[i]], starts[vertices[i] + 1]
+        e = first + np.searchsorted(listed[first:last], texels[i])
+        if e < last and listed[e] == texels[i]:
+            weight = power[i] * (np.float32(shares[e]) / np.float32(FULL))
+        if weight == 0:
+            continue
+        value = np.zeros((1, tables.shape[3]), np.float32)
+        u, v, w = directions[i]
+        _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
+        result[i] = value[0, term[i]]
     return result
 
 
