@@ -104,6 +104,12 @@ def _under(start: str, arrays: Arrays) -> Arrays:
 
 # --- files of versions 1 to 6 -------------------------------------------------------------------------------
 
+# how names of arrays began, and what followed, of each kind of compressed operator
+_COMPRESSED = {
+    "clustered": ("cluster", ("labels", "coefficients", "means", "bases")),
+    "haar_rows": ("haar", ("starts", "places", "values", "scales")),
+}
+
 
 def _upgraded(attributes: dict[str, Any], old: Arrays) -> tuple[dict[str, Any], Arrays]:
     """Attributes and arrays of a file as version 7 has them."""
@@ -116,8 +122,8 @@ def _upgraded(attributes: dict[str, Any], old: Arrays) -> tuple[dict[str, Any], 
     surfaces += [name for name in old if name.startswith("factors_")]
     new |= {f"reflection.{name}": old[name] for name in surfaces}
     kinds: dict[str, str] = {}
-    direct = _upgraded_glossy(old) if glossy else _upgraded_direct(attributes["basis"], old)
-    for part in (direct, _upgraded_indirect(old) if attributes["indirect"] else ({}, {})):
+    indirect = _upgraded_indirect(old) if attributes["indirect"] else ({}, {})
+    for part in (_upgraded_direct(attributes, old), indirect):
         kinds, new = kinds | part[0], new | part[1]
     return {
         "format": FORMAT,
@@ -135,50 +141,40 @@ def _upgraded(attributes: dict[str, Any], old: Arrays) -> tuple[dict[str, Any], 
     }, new
 
 
-def _upgraded_direct(basis: str, old: Arrays) -> tuple[dict[str, str], Arrays]:
-    if "cluster_labels" in old:
-        return _upgraded_clusters(old)
-    if "haar_scales" in old:
-        names = ("starts", "places", "values", "scales")
-        return {"compressed": "haar_rows"}, {f"compressed.{name}": old[f"haar_{name}"] for name in names}
-    if basis == "texel" and "shares" not in old:
+def _upgraded_direct(attributes: dict[str, Any], old: Arrays) -> tuple[dict[str, str], Arrays]:
+    """Kinds and arrays of direct light, or of all light of a compressed matrix."""
+    for kind, (start, names) in _COMPRESSED.items():
+        if f"{start}_{names[0]}" in old:
+            return {"compressed": kind}, {f"compressed.{name}": old[f"{start}_{name}"] for name in names}
+    if attributes.get("basis") == "texel" and "shares" not in old:
         return {"direct": "mean_cosine"}, {"direct.mean_cosine": old["mean_cosine"]}
     bits = {"visibility": old["visibility"], "normals": old["normals"]}
-    if basis == "texel":
+    if attributes.get("basis") == "texel":
         bits |= {"starts": old["share_starts"], "texels": old["share_texels"], "shares": old["shares"]}
-        return {"direct": "fractional_visibility"}, {f"direct.{name}": a for name, a in bits.items()}
+        return {"direct": "fractional_visibility"}, _below("direct", bits)
+    if "factors" in attributes:
+        material = np.full(len(old["material"]), -1, np.int64)
+        material[old["material"] >= 0] = old["incident_numbers"]
+        own = {"tangents": old["tangents"], "material": material, "tables": old["incident_tables"]}
+        kinds = {"direct": "factored_visibility", "direct.visibility": "visibility"}
+        return kinds, _below("direct.visibility", bits) | _below("direct", own)
     if "weights_direct_data" in old:
-        arrays = {f"direct.dense.{name}": a for name, a in bits.items()}
         weights = _renamed("weights_direct", "direct.weights", old)
-        return {"direct": "interpolated", "direct.dense": "visibility"}, arrays | weights
-    return {"direct": "visibility"}, {f"direct.{name}": a for name, a in bits.items()}
+        return {"direct": "interpolated", "direct.dense": "visibility"}, _below(
+            "direct.dense", bits
+        ) | weights
+    return {"direct": "visibility"}, _below("direct", bits)
 
 
-def _upgraded_glossy(old: Arrays) -> tuple[dict[str, str], Arrays]:
-    if "cluster_labels" in old:
-        return _upgraded_clusters(old)
-    material = np.full(len(old["material"]), -1, np.int64)
-    material[old["material"] >= 0] = old["incident_numbers"]
-    return {"direct": "factored_visibility", "direct.visibility": "visibility"}, {
-        "direct.visibility.visibility": old["visibility"],
-        "direct.visibility.normals": old["normals"],
-        "direct.tangents": old["tangents"],
-        "direct.material": material,
-        "direct.tables": old["incident_tables"],
-    }
-
-
-def _upgraded_clusters(old: Arrays) -> tuple[dict[str, str], Arrays]:
-    names = ("labels", "coefficients", "means", "bases")
-    return {"compressed": "clustered"}, {f"compressed.{name}": old[f"cluster_{name}"] for name in names}
+def _below(start: str, arrays: Arrays) -> Arrays:
+    """Arrays by names that begin so."""
+    return {f"{start}.{name}": array for name, array in arrays.items()}
 
 
 def _upgraded_indirect(old: Arrays) -> tuple[dict[str, str], Arrays]:
     if "left_0" in old:
-        factors = {
-            f"indirect.{name}": array for name, array in old.items() if name.startswith(("left_", "right_"))
-        }
-        return {"indirect": "low_rank"}, factors
+        factors = {name: array for name, array in old.items() if name.startswith(("left_", "right_"))}
+        return {"indirect": "low_rank"}, _below("indirect", factors)
     if "weights_indirect_data" in old:
         dense = {"indirect.dense.density": old["indirect"]}
         dense |= _renamed("upsampling", "indirect.dense.upsampling", old)

@@ -52,7 +52,7 @@ class Items:
     rows : (n, r) int64
         Numbers of each vertex's rows: one, or more for the terms of a BRDF.
     areas : (n,) float32
-    shades : (n, r * channels) float32
+    output_weights : (n, r * channels) float32
         What the rows are multiplied with in T, squared, all three channels together.
     keys : (n,) uint64
         Of the vertices.
@@ -60,7 +60,7 @@ class Items:
 
     rows: Indices
     areas: Floats
-    shades: Floats
+    output_weights: Floats
     keys: NDArray[np.uint64]
 
 
@@ -89,7 +89,7 @@ class SphereRows:
 
     def rows(self, ids: Indices) -> Floats:
         """(k, r * channels, n_directions)."""
-        result = np.empty((len(ids), self.items.shades.shape[1], len(self.scale)), np.float32)
+        result = np.empty((len(ids), self.items.output_weights.shape[1], len(self.scale)), np.float32)
         per_item = self.items.rows.shape[1]
         for a in range(0, len(ids), EXPANDED):
             some = ids[a : a + EXPANDED]
@@ -112,7 +112,7 @@ class SphereRows:
         """Of all vertices, (n, r * channels, q) for q vectors."""
         vectors: Floats = span.T * self._inverse[:, None]
         found = self._incident.take(self.items.rows.ravel()).apply(vectors)  # [row, channel, vector]
-        return found.reshape(len(self), self.items.shades.shape[1], len(span))
+        return found.reshape(len(self), self.items.output_weights.shape[1], len(span))
 
 
 def mesh_rows(transport: LightTransport, mesh: MeshRange) -> SphereRows:
@@ -121,11 +121,11 @@ def mesh_rows(transport: LightTransport, mesh: MeshRange) -> SphereRows:
     Terms count in T as their outgoing factors do on average over views, which are orthogonal to each other.
     """
     own, measurement = mesh.vertices, transport.measurement
-    rows, shades = transport.reflection.squares(own)
+    rows, output_weights = transport.reflection.squares(own)
     if transport.incident.shape[2] == 1:  # it stands for three
-        shades = shades.sum(axis=2, keepdims=True)
-    shades = shades.reshape(len(rows), -1).astype(np.float32)
-    return SphereRows(transport, Items(rows, measurement.areas[own], shades, measurement.keys[own]))
+        output_weights = output_weights.sum(axis=2, keepdims=True)
+    output_weights = output_weights.reshape(len(rows), -1).astype(np.float32)
+    return SphereRows(transport, Items(rows, measurement.areas[own], output_weights, measurement.keys[own]))
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class _Spaces:
 
     def __init__(self, rows: SphereRows, found: Clusters, coordinates: Floats, centred: bool) -> None:
         self._rows, self._found, self._coordinates, self._centred = rows, found, coordinates, centred
-        k, b, m, lines = *found.bases.shape[:2], len(rows.scale), rows.items.shades.shape[1]
+        k, b, m, lines = *found.bases.shape[:2], len(rows.scale), rows.items.output_weights.shape[1]
         self.means, self.bases = np.zeros((k, m), np.float16), np.zeros((k, b, m), np.float16)
         self.coefficients = np.zeros((len(rows), lines, b), np.float16)
         self._random = random_mixtures(min(len(rows), FITTED) * lines, b)
@@ -235,11 +235,18 @@ class _Spaces:
         points = np.concatenate([along.reshape(len(flat), -1), ones], axis=1)
         sums = _squares(flat, points, np.concatenate([basis, mean[None]]), self._squared_scale)
         sums = sums.reshape(4, *some.shape[:2])
-        weights, shades = self._rows.weights[ids].astype(np.float64), self._rows.items.shades[ids]
+        weights, output_weights = (
+            self._rows.weights[ids].astype(np.float64),
+            self._rows.items.output_weights[ids],
+        )
         kept = np.square(along, dtype=np.float64).sum(axis=1)[:, ::-1]  # [vertex, vector], the last one first
         parts = np.column_stack([sums[1].sum(axis=1), kept])
         more = np.cumsum(parts, axis=1)[:, ::-1]  # [vertex, vectors that count]
-        rest = weights @ sums[0].sum(axis=1), (shades * sums[3]).sum(), (shades * sums[2]).sum()
+        rest = (
+            weights @ sums[0].sum(axis=1),
+            (output_weights * sums[3]).sum(),
+            (output_weights * sums[2]).sum(),
+        )
         return np.concatenate([weights @ more, rest])
 
     def _fit(self, c: int, ids: Indices, some: Floats) -> None:

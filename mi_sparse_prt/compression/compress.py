@@ -186,7 +186,9 @@ def matrix_errors(exact: LightTransport, other: LightTransport) -> dict[str, flo
             ids = np.arange(a, min(a + ROWS, len(truth)))
             rows = truth.rows(ids)
             for k, values in enumerate((ours.rows(ids) - rows, rows)):
-                pair[k] += (truth.items.shades[ids] * (np.square(values) @ squares)).sum(dtype=np.float64)
+                pair[k] += (truth.items.output_weights[ids] * (np.square(values) @ squares)).sum(
+                    dtype=np.float64
+                )
         sums.append((float(pair[0]), float(pair[1])))
     return _errors(exact, sums)
 

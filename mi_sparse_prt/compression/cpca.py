@@ -82,14 +82,11 @@ def standard_cpca(
     Clusters
         None is empty.
     """
-    found, compared = seed_clusters(rows, weights, clusters, centred, seed), 0
+    assignment = _Assignment(rows, 1 if exhaustive else CANDIDATES)
+    found = seed_clusters(rows, weights, clusters, centred, seed)
     for b in range(bases + 1):
         for repeat in range(ITERATIONS if 0 < b < bases else SETTLING):
-            if exhaustive or (repeat == 0 and b % COMPARED == 0) or compared != len(found):
-                nearest = nearest_clusters(rows, found, 1 if exhaustive else CANDIDATES)
-                labels, compared = nearest[:, 0], len(found)
-            else:
-                labels = reassign(rows, found, nearest)
+            labels = assignment.labels(found, exhaustive or (repeat == 0 and b % COMPARED == 0))
             found = fit_spaces(rows, weights, found.with_labels(labels), b, centred)
     return found
 
@@ -125,15 +122,26 @@ def two_pass_cpca(
 
 def lloyd_refine(rows: Floats, weights: Floats, clusters: Clusters, bases: int, centred: bool) -> Clusters:
     """All items (n, g, m) in their nearest clusters, which follow, a few times; no basis vectors are added."""
-    found, compared = clusters, 0
+    assignment = _Assignment(rows, CANDIDATES)
     for _ in range(SETTLING):
-        if compared != len(found):
-            nearest = nearest_clusters(rows, found, CANDIDATES)
-            labels, compared = nearest[:, 0], len(found)
-        else:
-            labels = reassign(rows, found, nearest)
-        found = fit_spaces(rows, weights, found.with_labels(labels), bases, centred)
-    return found
+        labels = assignment.labels(clusters)
+        clusters = fit_spaces(rows, weights, clusters.with_labels(labels), bases, centred)
+    return clusters
+
+
+class _Assignment:
+    """Items (n, g, m) to their nearest clusters, of which those that were near the last time are compared."""
+
+    def __init__(self, rows: Floats, candidates: int) -> None:
+        self._rows, self._count, self._compared = rows, candidates, 0
+        self._nearest = np.zeros((len(rows), 0), np.int64)  # [item, candidate]
+
+    def labels(self, clusters: Clusters, all_clusters: bool = False) -> Indices:
+        """The nearest cluster of each item, (n,); all are compared if asked for, or if some disappeared."""
+        if not all_clusters and self._compared == len(clusters):
+            return reassign(self._rows, clusters, self._nearest)
+        self._nearest, self._compared = nearest_clusters(self._rows, clusters, self._count), len(clusters)
+        return self._nearest[:, 0]
 
 
 def seed_clusters(rows: Floats, weights: Floats, clusters: int, centred: bool, seed: int) -> Clusters:

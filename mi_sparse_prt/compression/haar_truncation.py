@@ -47,7 +47,7 @@ class HaarMesh:
     ----------
     part : HaarRows
         Of its vertices alone.
-    energy, left_out : float
+    energy, residual : float
         Squared norm of the rows on the sphere, weighted by area, and what is left out of it before numbers are rounded.
     on_sphere : float
         Squared error, weighted so; rounding included.
@@ -57,7 +57,7 @@ class HaarMesh:
 
     part: HaarRows
     energy: float
-    left_out: float
+    residual: float
     on_sphere: float
     squares: float
     norms: float
@@ -106,7 +106,7 @@ def haar_part(
             for name, some in zip(names, lengths, strict=True)
         },
         "kept_energy": {
-            name: 1 - mesh.left_out / mesh.energy if mesh.energy > 0 else 1.0
+            name: 1 - mesh.residual / mesh.energy if mesh.energy > 0 else 1.0
             for name, mesh in by_name.items()
         },
         "error": relative_l2_by_name({name: (mesh.squares, mesh.norms) for name, mesh in by_name.items()})
@@ -217,10 +217,10 @@ def _sums(rows: Floats, part: HaarRows, energies: Doubles, weights: Floats, albe
     """The five numbers of a ``HaarMesh``, of rows (n, channels, m)."""
     solid_angles = part.lighting.solid_angles
     away = rows - np.moveaxis(part.rows(np.arange(len(rows))), 2, 1) / np.sqrt(solid_angles)
-    shades = np.square(albedo, dtype=np.float64)  # [vertex, rgb]; one channel stands for three
+    output_weights = np.square(albedo, dtype=np.float64)  # [vertex, rgb]; one channel stands for three
     weighted = weights.astype(np.float64) @ energies.sum(axis=1)
     on_sphere = weights.astype(np.float64) @ np.einsum("ncm,ncm->n", away, away)
-    squares, norms = ((shades * (np.square(x) @ solid_angles)).sum() for x in (away, rows))
+    squares, norms = ((output_weights * (np.square(x) @ solid_angles)).sum() for x in (away, rows))
     return np.array([*weighted, on_sphere, squares, norms])
 
 

@@ -14,8 +14,6 @@ coefficients of a face are the transform of a face of 2^l x 2^l texels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pywt
 from numpy.typing import NDArray
@@ -53,35 +51,3 @@ def _faces(values: Floats) -> Floats:
     """(..., 6, n, n)."""
     n = round((values.shape[-1] / 6) ** 0.5)
     return values.reshape(*values.shape[:-1], 6, n, n)
-
-
-@dataclass(frozen=True)
-class HaarSquares:
-    """What each coefficient of a cubemap with n texels along a face's edge belongs to, all (6 n^2,) int64.
-
-    Attributes
-    ----------
-    face : 0 to 5
-    level : 0 to log2(n) - 1
-        Its squares are n / 2^level texels wide; 0 for a face's mean as well.
-    kind : 0 to 3
-        0 is a face's mean; see the module for 1 to 3.
-    row, col : 0 to 2^level - 1
-        Of the square among those of its level.
-    """
-
-    face: NDArray[np.int64]
-    level: NDArray[np.int64]
-    kind: NDArray[np.int64]
-    row: NDArray[np.int64]
-    col: NDArray[np.int64]
-
-
-def haar_squares(resolution: int) -> HaarSquares:
-    """Names of all coefficients of a cubemap of ``resolution`` texels along a face's edge, a power of two."""
-    n = resolution
-    face, row, col = np.unravel_index(np.arange(6 * n * n), (6, n, n))
-    level = np.log2(np.maximum(np.maximum(row, col), 1)).astype(np.int64)
-    squares = 1 << level  # along an edge
-    down, across = (row >= squares).astype(np.int64), (col >= squares).astype(np.int64)
-    return HaarSquares(face, level, 2 * down + across, row - down * squares, col - across * squares)

@@ -11,6 +11,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_to_arrays
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.scene import Scene
 
@@ -121,17 +122,11 @@ class Measurement:
 
     def combined(self, values: Floats) -> Floats:
         """Outputs (outputs, ...) of values at all points (n, ...)."""
-        if self.weights is None:
-            return values
-        flat = self.weights @ values.reshape(len(values), -1)
-        return flat.reshape(-1, *values.shape[1:])
+        return values if self.weights is None else _product(self.weights, values)
 
     def combined_adjoint(self, values: Floats) -> Floats:
         """The transpose of ``combined``: (outputs, ...) to (n, ...)."""
-        if self.weights is None:
-            return values
-        flat = self.weights.T @ values.reshape(len(values), -1)
-        return flat.reshape(-1, *values.shape[1:])
+        return values if self.weights is None else _product(self.weights.T, values)
 
     def take(self, points: NDArray[np.integer], groups: tuple[MeshRange, ...]) -> Measurement:
         """Some points, in this order, which are in these groups; without weights."""
@@ -140,9 +135,7 @@ class Measurement:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What files keep, beside ``attributes``."""
         own: dict[str, NDArray[Any]] = {"keys": self.keys, "areas": self.areas}
-        if self.weights is not None:
-            own |= {f"weights_{part}": getattr(self.weights, part) for part in ("data", "indices", "indptr")}
-        return own
+        return own if self.weights is None else own | sparse_to_arrays("weights", self.weights)
 
     def attributes(self) -> dict[str, Any]:
         """JSON as it is."""
@@ -156,14 +149,16 @@ class Measurement:
         keys, areas = arrays["keys"], arrays["areas"]
         if areas.shape != keys.shape or (groups and groups[-1].vertices.stop != len(keys)):
             raise ValueError("points and their areas do not fit together")
-        weights = None
-        if "weights_indptr" in arrays:
-            data, indices, indptr = (arrays[f"weights_{part}"] for part in ("data", "indices", "indptr"))
-            weights = scipy.sparse.csr_array((data, indices, indptr), shape=(len(indptr) - 1, len(keys)))
-            weights.check_format(full_check=True)
+        some = "weights_indptr" in arrays
+        weights = sparse_from_arrays("weights", arrays, len(keys)) if some else None
         image = attributes.get("image")
         kind = attributes.get("kind", "vertices")
         return cls(keys, areas, groups, kind, weights=weights, image=tuple(image) if image else None)
+
+
+def _product(weights: scipy.sparse.sparray, values: Floats) -> Floats:
+    """Weights (m, n) times values (n, ...)."""
+    return (weights @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
 
 def mesh_vertices(scene: Scene) -> Measurement:

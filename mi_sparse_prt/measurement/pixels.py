@@ -38,13 +38,7 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     PrtError
         If the scene has no such sensor, or the camera sees no surface.
     """
-    if isinstance(sensor, int):
-        sensors = scene.mitsuba.sensors()
-        if not -len(sensors) <= sensor < len(sensors):
-            raise PrtError(
-                f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
-            )
-        sensor = sensors[sensor]
+    sensor = scene.sensor(sensor)
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
     places = _jittered(width, height, spp, seed)

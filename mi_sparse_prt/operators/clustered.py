@@ -5,16 +5,15 @@ Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), whose L2 norm i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator, multiply_converted
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,8 @@ class Clustered(Operator):
     """
 
     kind: ClassVar[str] = "clustered"
+    stored: ClassVar[tuple[str, ...]] = ("labels", "coefficients", "means", "bases")
+    by_row: ClassVar[tuple[str, ...]] = ("labels", "coefficients")
     labels: NDArray[np.unsignedinteger]
     coefficients: NDArray[np.float16]
     means: NDArray[np.float16]
@@ -43,10 +44,6 @@ class Clustered(Operator):
     @property
     def shape(self) -> tuple[int, int, int]:
         return len(self.labels), self.lighting.n_directions, self.coefficients.shape[1]
-
-    @property
-    def nbytes(self) -> int:
-        return self.labels.nbytes + self.coefficients.nbytes + self.means.nbytes + self.bases.nbytes
 
     def rows(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)
@@ -68,15 +65,18 @@ class Clustered(Operator):
         means, products = self._products(lighting)
         return _relit(self.labels, self.coefficients.astype(np.float32), means, products)
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return self._combined(*self._products(x))
+    def apply(self, x: Floats) -> Floats:
+        if np.ndim(x) == 2:  # means and basis vectors meet the vectors once, not once for each channel
+            return self._combined(*self._products(np.asarray(x, np.float32)))
+        return super().apply(x)
 
-    def _apply_each(self, x: Floats) -> Floats:
-        return np.stack(
-            [self._combined(*self._products(x[:, c]), slice(c, c + 1))[:, 0] for c in range(3)], axis=1
-        )
+    def _apply(self, x: Floats) -> Floats:
+        channels = [
+            self._combined(*self._products(x[:, c]), slice(c, c + 1))[:, 0] for c in range(x.shape[1])
+        ]
+        return np.stack(channels, axis=1)
 
-    def _adjoint_by_rows(self, y: Floats) -> Floats:
+    def _adjoint(self, y: Floats) -> Floats:
         """By clusters, not by rows: ``y`` is gathered in coefficients of means and of basis vectors."""
         result = np.zeros((self.shape[1], *y.shape[1:]), np.float32)
         for c in range(len(self.means)):
@@ -88,24 +88,15 @@ class Clustered(Operator):
             result += mean[:, None, None] * y[here].sum(axis=0)
         return result * self._scale()[:, None, None]
 
-    def take(self, ids: Ids) -> Clustered:
-        return replace(self, labels=self.labels[ids], coefficients=self.coefficients[ids])
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        names = ("labels", "coefficients", "means", "bases")
-        return {name: getattr(self, name) for name in names}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        labels, coefficients, means, bases = (arrays[n] for n in ("labels", "coefficients", "means", "bases"))
+    def check(self) -> None:
+        _, channels, b = self.coefficients.shape
         # a wrong label would read beyond the clusters
-        if coefficients.shape[1] not in (1, 3) or (len(labels) and labels.max() >= len(means)):
+        if channels not in (1, 3) or (len(self.labels) and self.labels.max() >= len(self.means)):
             raise ValueError("clusters and their vertices do not fit together")
-        if bases.shape[:2] != (len(means), coefficients.shape[2]) or len(labels) != len(coefficients):
+        if self.bases.shape[:2] != (len(self.means), b) or len(self.labels) != len(self.coefficients):
             raise ValueError("basis vectors and coefficients do not fit together")
-        if not means.shape[1] == bases.shape[2] == lighting.n_directions:
+        if not self.means.shape[1] == self.bases.shape[2] == self.lighting.n_directions:
             raise ValueError("clusters do not fit the lighting")
-        return cls(labels, coefficients, means, bases, lighting)
 
     def _products(self, vectors: Floats) -> tuple[Floats, Floats]:
         """Of means (k, any) and of basis vectors (k, b, any) with vectors (n_directions, any)."""

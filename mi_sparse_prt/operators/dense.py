@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
@@ -29,6 +28,8 @@ class Dense(Operator):
     """
 
     kind: ClassVar[str] = "dense"
+    stored: ClassVar[tuple[str, ...]] = ("values",)
+    by_row: ClassVar[tuple[str, ...]] = ("values",)
     values: NDArray[np.float32]
 
     def __post_init__(self) -> None:
@@ -42,10 +43,6 @@ class Dense(Operator):
         n, m, channels = self.values.shape
         return n, m, channels
 
-    @property
-    def nbytes(self) -> int:
-        return self.values.nbytes
-
     def rows(self, ids: Ids) -> Floats:
         return self.values[ids]
 
@@ -54,13 +51,3 @@ class Dense(Operator):
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
         return self.values[ids, texels]
-
-    def take(self, ids: Ids) -> Dense:
-        return replace(self, values=self.values[ids])
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {"values": self.values}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: EmissionSpace) -> Self:
-        return cls(arrays["values"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numba
 import numpy as np
@@ -18,10 +18,13 @@ from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
-from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.operators.visibility import SeenTexels, Visibility
 from mi_sparse_prt.reflection.frames import frames
 
 LANES = 4  # terms at a time
+
+#: Numbers of glossy points, their frames, the numbers of their tables, and these.
+GlossyPoints = tuple[NDArray[np.int64], Floats, NDArray[np.int64], Floats]
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class FactoredVisibility(Operator):
     """
 
     kind: ClassVar[str] = "factored_visibility"
+    stored: ClassVar[tuple[str, ...]] = ("visibility", "tangents", "material", "tables")
     visibility: Visibility | FractionalVisibility
     tangents: Floats
     material: NDArray[np.int64]
@@ -71,28 +75,14 @@ class FactoredVisibility(Operator):
         """(n_g, 3, 3), from the world to the frames of the glossy points."""
         return frames(self.tangents[self.glossy], self.visibility.normals[self.glossy])
 
-    @property
-    def nbytes(self) -> int:
-        return self.visibility.nbytes + self.tangents.nbytes + self.material.nbytes + self.tables.nbytes
-
     @cached_property
     def _padded(self) -> Floats:
         """Tables with as many terms as vector instructions take."""
         return np.pad(self.tables, ((0, 0), (0, 0), (0, 0), (0, -self.terms % LANES)))
 
-    @cached_property
-    def _seen(self) -> tuple[NDArray[Any], ...]:
-        """Bits of all points, and where some texels are seen in part: starts, texels, shares."""
-        return self.visibility.bits, *self.visibility.listed
-
-    def _points(self, which: Ids) -> tuple[NDArray[Any], ...]:
-        """Numbers, frames, tables' numbers and tables of some glossy points."""
+    def _points(self, which: Ids | slice = slice(None)) -> GlossyPoints:
         vertices = self.glossy[which]
         return vertices, self.frames[which], self.material[vertices], self._padded
-
-    @property
-    def _all(self) -> tuple[NDArray[Any], ...]:
-        return self._points(np.arange(len(self.glossy)))
 
     def rows(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)
@@ -116,10 +106,8 @@ class FactoredVisibility(Operator):
         which, term = np.divmod(ids[~diffuse] - len(self.material), self.terms)
         asked = texels[~diffuse].astype(np.int64)
         directions, power = self.lighting.directions[asked], self.lighting.solid_angles[asked]
-        vertices, own_frames, materials, tables = self._points(which)
-        arguments: Any = (*self._seen, vertices, own_frames, materials, tables)
-        places: Any = asked, directions, power.astype(np.float32), term
-        result[~diffuse, 0] = _single(*arguments, *places)
+        places = asked, directions, power.astype(np.float32), term
+        result[~diffuse, 0] = _single(self.visibility.seen, self._points(which), *places)
         return result
 
     def dense_columns(self, texels: Ids, out: Floats) -> Floats:
@@ -138,8 +126,7 @@ class FactoredVisibility(Operator):
     def relight(self, lighting: Floats) -> Floats:
         directions = np.ascontiguousarray(self.lighting.directions.T)
         power = (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
-        arguments: Any = (*self._seen, *self._all, directions, power, self.terms)
-        terms = _relit(*arguments)
+        terms = _relit(self.visibility.seen, self._points(), directions, power, self.terms)
         return np.concatenate([self.visibility.relight(lighting), terms.reshape(-1, 3)])
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
@@ -148,9 +135,8 @@ class FactoredVisibility(Operator):
         power = (signs * self.lighting.solid_angles[texels]).astype(np.float32)
         place = np.full(-(-self.lighting.n_directions // signs.shape[1]), -1)
         place[words] = np.arange(len(words))
-        chosen = np.asarray(words, np.int64), place, directions, power, self.terms
-        arguments: Any = (*self._seen, *self._all, *chosen)
-        found = _combined(*arguments)
+        chosen = np.asarray(words, np.int64), place, directions, power
+        found = _combined(self.visibility.seen, self._points(), *chosen, self.terms)
         return np.concatenate([self.visibility.combined(words, signs), found.reshape(-1, signs.shape[1])])
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> FactoredVisibility:
@@ -174,9 +160,10 @@ class FactoredVisibility(Operator):
         return RowSelection(part, place)
 
     def _of_points(self, points: Ids) -> FactoredVisibility:
+        visibility: Any = self.visibility.take(points)  # of the same kind
         return replace(
             self,
-            visibility=self.visibility.take(points),
+            visibility=visibility,
             tangents=self.tangents[points],
             material=self.material[points],
         )
@@ -187,32 +174,22 @@ class FactoredVisibility(Operator):
         terms = len(self.material) + own[:, None] * self.terms + np.arange(self.terms)
         return np.concatenate([points, terms.ravel()])
 
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        names = ("visibility", "tangents", "material", "tables")
-        return {name: getattr(self, name) for name in names}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        visibility, tangents, material, tables = (
-            arrays[name] for name in ("visibility", "tangents", "material", "tables")
-        )
-        n = visibility.shape[0]
-        if tangents.shape != (n, 3) or material.shape != (n,):
+    def check(self) -> None:
+        n = self.visibility.shape[0]
+        if self.tangents.shape != (n, 3) or self.material.shape != (n,):
             raise ValueError("vertices and their tangents do not fit together")
         # a wrong number would read beyond the tables
-        if n and not -1 <= material.min() <= material.max() < len(tables):
+        if n and not -1 <= self.material.min() <= self.material.max() < len(self.tables):
             raise ValueError("tables of incident factors and their vertices do not fit together")
-        if tables.ndim != 4 or tables.shape[1] != tables.shape[2]:
+        if self.tables.ndim != 4 or self.tables.shape[1] != self.tables.shape[2]:
             raise ValueError("tables of incident factors are not square")
-        return cls(visibility, tangents, material, tables)
 
     def _term_values(self, which: Ids, texels: Ids) -> Floats:
         """Terms (n, K, m) of some glossy points at some texels."""
         directions = np.ascontiguousarray(self.lighting.directions[texels].T)
         power = self.lighting.solid_angles[texels].astype(np.float32)
         asked = np.asarray(texels, np.int64)
-        arguments: Any = (*self._seen, *self._points(which), asked, directions, power, self.terms)
-        return _expanded(*arguments)
+        return _expanded(self.visibility.seen, self._points(which), asked, directions, power, self.terms)
 
 
 @dataclass(frozen=True)
@@ -227,16 +204,14 @@ class RowSelection(Operator):
     """
 
     kind: ClassVar[str] = "row_selection"
+    stored: ClassVar[tuple[str, ...]] = ("operator", "place")
+    by_row: ClassVar[tuple[str, ...]] = ("place",)
     operator: Operator
     place: NDArray[np.int64]
 
     @property
     def shape(self) -> tuple[int, int, int]:
         return len(self.place), *self.operator.shape[1:]
-
-    @property
-    def nbytes(self) -> int:
-        return self.operator.nbytes + self.place.nbytes
 
     def rows(self, ids: Ids) -> Floats:
         return self.operator.rows(self.place[ids])
@@ -247,18 +222,9 @@ class RowSelection(Operator):
     def relight(self, lighting: Floats) -> Floats:
         return self.operator.relight(lighting)[self.place]
 
-    def take(self, ids: Ids) -> RowSelection:
-        return replace(self, place=self.place[ids])
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {"operator": self.operator, "place": self.place}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        operator, place = arrays["operator"], arrays["place"]
-        if len(place) and not 0 <= place.min() <= place.max() < operator.shape[0]:
+    def check(self) -> None:
+        if len(self.place) and not 0 <= self.place.min() <= self.place.max() < self.operator.shape[0]:
             raise ValueError("rows are selected that are not there")
-        return cls(operator, place)
 
 
 @numba.njit(fastmath=True, inline="always")
@@ -292,20 +258,15 @@ def _add(
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _expanded(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    listed: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
-    vertices: NDArray[np.int64],
-    frames: Floats,
-    materials: NDArray[np.int64],
-    tables: Floats,
+    seen: SeenTexels,
+    points: GlossyPoints,
     texels: NDArray[np.int64],
     directions: Floats,
     power: Floats,
     terms: int,
 ) -> Floats:
     """Terms (n, terms, m) at texels (m,), whose directions are (3, m)."""
+    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     result = np.zeros((len(vertices), terms, len(texels)), np.float32)
     for i in numba.prange(len(vertices)):
         value = np.empty((1, tables.shape[3]), np.float32)
@@ -329,20 +290,15 @@ def _expanded(
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _single(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    listed: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
-    vertices: NDArray[np.int64],
-    frames: Floats,
-    materials: NDArray[np.int64],
-    tables: Floats,
+    seen: SeenTexels,
+    points: GlossyPoints,
     texels: NDArray[np.int64],
     directions: Floats,
     power: Floats,
     term: NDArray[np.int64],
 ) -> Floats:
     """One term (m,) at one texel each, whose directions are (m, 3)."""
+    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     result = np.zeros(len(vertices), np.float32)
     for i in numba.prange(len(vertices)):
         weight = power[i] * np.float32(bit_of(bits[vertices[i]], texels[i]))
@@ -361,19 +317,14 @@ def _single(
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _relit(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    listed: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
-    vertices: NDArray[np.int64],
-    frames: Floats,
-    materials: NDArray[np.int64],
-    tables: Floats,
+    seen: SeenTexels,
+    points: GlossyPoints,
     directions: Floats,
     power: Floats,
     terms: int,
 ) -> Floats:
     """Coefficients (n, terms, 3) under lights power (n_directions, 3), solid angles included."""
+    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     result = np.empty((len(vertices), terms, 3), np.float32)
     for i in numba.prange(len(vertices)):
         total = np.zeros((3, tables.shape[3]), np.float32)
@@ -404,14 +355,8 @@ def _relit(
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _combined(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    listed: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
-    vertices: NDArray[np.int64],
-    frames: Floats,
-    materials: NDArray[np.int64],
-    tables: Floats,
+    seen: SeenTexels,
+    points: GlossyPoints,
     words: NDArray[np.int64],
     place: NDArray[np.int64],
     directions: Floats,
@@ -422,6 +367,7 @@ def _combined(
 
     ``place`` says where among ``words`` a word is, or -1.
     """
+    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     width = power.shape[1]
     result = np.empty((len(vertices), terms, width), np.float32)
     for i in numba.prange(len(vertices)):

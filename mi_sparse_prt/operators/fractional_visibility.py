@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numba
 import numpy as np
@@ -18,7 +18,7 @@ from mi_sparse_prt.core.bits import BITS, Bits, bit_of, bits_at
 from mi_sparse_prt.core.ragged import select_rows
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
-from mi_sparse_prt.operators.visibility import check_bits
+from mi_sparse_prt.operators.visibility import SeenTexels, check_bits
 
 FULL = 255  # a share of 1
 _PARTS = 256  # of a face per axis, over which directions are averaged
@@ -43,6 +43,8 @@ class FractionalVisibility(Operator):
     """
 
     kind: ClassVar[str] = "fractional_visibility"
+    stored: ClassVar[tuple[str, ...]] = ("bits", "normals", "starts", "texels", "shares")
+    file_names: ClassVar[dict[str, str]] = {"bits": "visibility"}
     bits: NDArray[np.uint32]
     starts: NDArray[np.int64]
     texels: NDArray[np.unsignedinteger]
@@ -55,9 +57,9 @@ class FractionalVisibility(Operator):
         return len(self.bits), self.lighting.n_directions, 1
 
     @property
-    def listed(self) -> tuple[NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
-        """``starts``, ``texels`` and ``shares``."""
-        return self.starts, self.texels, self.shares
+    def seen(self) -> SeenTexels:
+        """``bits``, ``starts``, ``texels`` and ``shares``."""
+        return self.bits, self.starts, self.texels, self.shares
 
     @property
     def edges(self) -> Bits | None:
@@ -76,11 +78,10 @@ class FractionalVisibility(Operator):
         return columns if np.array_equal(distinct, ids) else columns[:, place]
 
     def relight(self, lighting: Floats) -> Floats:
-        directions, ramps = _means(self.lighting.resolution)
-        power = np.zeros((3, len(ramps)), np.float32)
+        directions, falloffs = _means(self.lighting.resolution)
+        power = np.zeros((3, len(falloffs)), np.float32)
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
-        listed = self.starts, self.texels, self.shares
-        return _relight(self.bits, *listed, self.normals, directions, ramps, power)
+        return _relight(self.seen, self.normals, directions, falloffs, power)
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> FractionalVisibility:
         bits, shares = self.bits.copy(), self.shares.copy()
@@ -102,37 +103,27 @@ class FractionalVisibility(Operator):
         )
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
-        beams = *_means(self.lighting.resolution), self._weights()
+        weighted = *_means(self.lighting.resolution), self._weights()
         asked = np.asarray(ids, np.int64), np.asarray(texels, np.int64)
-        return _single(self.bits, self.starts, self.texels, self.shares, self.normals, *beams, *asked)[
-            :, None
-        ]
+        return _single(self.seen, self.normals, *weighted, *asked)[:, None]
 
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        listed = {"starts": self.starts, "texels": self.texels, "shares": self.shares}
-        return {"visibility": self.bits, "normals": self.normals, **listed}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        names = ("visibility", "starts", "texels", "shares", "normals")
-        bits, starts, texels, shares, normals = (arrays[name] for name in names)
-        check_bits(bits, normals, lighting)
+    def check(self) -> None:
+        check_bits(self.bits, self.normals, self.lighting)
         # nothing that uses the lists looks whether they make sense
-        matrix = scipy.sparse.csr_array((shares, texels, starts), shape=(len(bits), lighting.n_directions))
+        lists = (self.shares, self.texels, self.starts)
+        matrix = scipy.sparse.csr_array(lists, shape=(len(self.bits), self.lighting.n_directions))
         matrix.check_format(full_check=True)
         if not matrix.has_canonical_format:
             raise ValueError("texels that are seen in part are not in order")
-        return cls(bits, starts, texels, shares, normals, lighting)
 
     def _expanded(self, ids: Ids) -> Floats:
         """Elements (n_v, k, 1) of texels (k,), no texel twice."""
-        directions, ramps = _means(self.lighting.resolution)
+        directions, falloffs = _means(self.lighting.resolution)
         place = np.full(self.lighting.n_directions, -1)
         place[ids] = np.arange(len(ids))
-        beams = np.ascontiguousarray(directions[:, ids]), ramps[ids], self._weights()[ids]
+        weighted = np.ascontiguousarray(directions[:, ids]), falloffs[ids], self._weights()[ids]
         result = np.empty((len(self.bits), len(ids)), np.float32)
-        listed = self.starts, self.texels, self.shares
-        _expand(self.bits, *listed, self.normals, np.asarray(ids, np.int64), *beams, place, result)
+        _expand(self.seen, self.normals, np.asarray(ids, np.int64), *weighted, place, result)
         return result[..., None]
 
     def _weights(self) -> Floats:
@@ -141,10 +132,10 @@ class FractionalVisibility(Operator):
 
 @cache
 def _means(resolution: int) -> tuple[Floats, Floats]:
-    """Mean directions (3, padded to whole words) and ramps (padded,) of a cubemap's texels.
+    """Mean directions (3, padded to whole words) and falloffs (padded,) of a cubemap's texels.
 
-    Over a texel n . w is between its mean m and m +- the ramp, evenly: near enough for the few texels that the horizon
-    cuts, exact for all others. The ramp has the variance of w along a random normal at right angles to it.
+    Over a texel n . w is between its mean m and m +- the falloff, evenly: near enough for the few texels that the
+    horizon cuts, exact for all others. The falloff has the variance of w along a random normal at right angles to it.
     """
     lighting = CubemapLighting(resolution)
     parts, areas = lighting.subdirections(max(4, _PARTS // resolution))
@@ -152,31 +143,29 @@ def _means(resolution: int) -> tuple[Floats, Floats]:
     mean = np.einsum("jk,jkd->jd", weights, parts)
     variance = np.einsum("jk,jkd->j", weights, (parts - mean[:, None]) ** 2) / 2
     padded = -(-lighting.n_directions // BITS) * BITS
-    directions, ramps = np.zeros((3, padded), np.float32), np.ones(padded, np.float32)
+    directions, falloffs = np.zeros((3, padded), np.float32), np.ones(padded, np.float32)
     directions[:, : len(mean)] = mean.T
-    ramps[: len(mean)] = np.sqrt(3 * variance)
-    return directions, ramps
+    falloffs[: len(mean)] = np.sqrt(3 * variance)
+    return directions, falloffs
 
 
 @numba.njit(fastmath=True, inline="always")
-def _mean_cosine(cosine: np.float32, ramp: np.float32) -> np.float32:
-    """Mean of max(0, x) for x evenly between cosine - ramp and cosine + ramp; without a branch."""
-    above = min(max(cosine + ramp, np.float32(0)), np.float32(2) * ramp)
-    return above * above / (np.float32(4) * ramp) + max(cosine - ramp, np.float32(0))
+def _mean_cosine(cosine: np.float32, falloff: np.float32) -> np.float32:
+    """Mean of max(0, x) for x evenly between cosine - falloff and cosine + falloff; without a branch."""
+    above = min(max(cosine + falloff, np.float32(0)), np.float32(2) * falloff)
+    return above * above / (np.float32(4) * falloff) + max(cosine - falloff, np.float32(0))
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _relight(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
+    seen_texels: SeenTexels,
     normals: Floats,
     directions: Floats,
-    ramps: Floats,
+    falloffs: Floats,
     power: Floats,
 ) -> Floats:
     """Sum of power[:, j] times the share and the mean cosine of texel j; the inner loop is one word of bits."""
+    bits, starts, texels, shares = seen_texels
     radiance = np.zeros((bits.shape[0], 3), dtype=np.float32)
     for i in numba.prange(bits.shape[0]):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -189,7 +178,7 @@ def _relight(
                 j = word * 32 + k
                 cosine = nx * directions[0, j] + ny * directions[1, j] + nz * directions[2, j]
                 bit = np.float32((mask >> np.uint32(k)) & np.uint32(1))
-                seen = _mean_cosine(cosine, ramps[j]) * bit
+                seen = _mean_cosine(cosine, falloffs[j]) * bit
                 red += seen * power[0, j]
                 green += seen * power[1, j]
                 blue += seen * power[2, j]
@@ -197,7 +186,7 @@ def _relight(
             j = texels[e]
             cosine = nx * directions[0, j] + ny * directions[1, j] + nz * directions[2, j]
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[i], j))
-            seen = _mean_cosine(cosine, ramps[j]) * more
+            seen = _mean_cosine(cosine, falloffs[j]) * more
             red += seen * power[0, j]
             green += seen * power[1, j]
             blue += seen * power[2, j]
@@ -207,28 +196,26 @@ def _relight(
 
 @numba.njit(parallel=True, cache=True)
 def _expand(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
+    seen_texels: SeenTexels,
     normals: Floats,
     ids: NDArray[np.int64],
     directions: Floats,
-    ramps: Floats,
+    falloffs: Floats,
     weights: Floats,
     place: NDArray[np.int64],
     result: Floats,
 ) -> None:
     """Elements of texels ``ids``, in ascending order of columns; ``place`` says which column a texel has, or -1.
 
-    Directions, ramps and weights are those of ``ids``.
+    Directions, falloffs and weights are those of ``ids``.
     """
+    bits, starts, texels, shares = seen_texels
     for i in numba.prange(len(bits)):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         for c in range(len(ids)):
             cosine = nx * directions[0, c] + ny * directions[1, c] + nz * directions[2, c]
             seen = np.float32(bit_of(bits[i], ids[c]))
-            result[i, c] = seen * _mean_cosine(cosine, ramps[c]) * weights[c]
+            result[i, c] = seen * _mean_cosine(cosine, falloffs[c]) * weights[c]
         if len(ids) == 0:
             continue
         own = texels[starts[i] : starts[i + 1]]
@@ -239,23 +226,21 @@ def _expand(
             if c >= 0:
                 cosine = nx * directions[0, c] + ny * directions[1, c] + nz * directions[2, c]
                 share = np.float32(shares[e]) / np.float32(FULL)
-                result[i, c] = share * _mean_cosine(cosine, ramps[c]) * weights[c]
+                result[i, c] = share * _mean_cosine(cosine, falloffs[c]) * weights[c]
 
 
 @numba.njit(parallel=True, cache=True)
 def _single(
-    bits: NDArray[np.uint32],
-    starts: NDArray[np.int64],
-    texels: NDArray[np.unsignedinteger],
-    shares: NDArray[np.uint8],
+    seen_texels: SeenTexels,
     normals: Floats,
     directions: Floats,
-    ramps: Floats,
+    falloffs: Floats,
     weights: Floats,
     ids: NDArray[np.int64],
     asked: NDArray[np.int64],
 ) -> Floats:
     """Elements of vertices ``ids`` and texels ``asked``."""
+    bits, starts, texels, shares = seen_texels
     result = np.empty(len(ids), np.float32)
     for m in numba.prange(len(ids)):
         i, j = ids[m], asked[m]
@@ -268,5 +253,5 @@ def _single(
             share = np.float32(shares[starts[i] + e]) / np.float32(FULL)
         else:
             share = np.float32(bit_of(bits[i], j))
-        result[m] = share * _mean_cosine(cosine, ramps[j]) * weights[j]
+        result[m] = share * _mean_cosine(cosine, falloffs[j]) * weights[j]
     return result

@@ -6,7 +6,7 @@ Rows are kept as functions on the sphere, t_j / sqrt(d_omega_j), for which the w
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numba
 import numpy as np
@@ -37,6 +37,7 @@ class HaarRows(Operator):
     """
 
     kind: ClassVar[str] = "haar_rows"
+    stored: ClassVar[tuple[str, ...]] = ("starts", "places", "values", "scales")
     starts: NDArray[np.int64]
     places: NDArray[np.unsignedinteger]
     values: NDArray[np.float16]
@@ -46,10 +47,6 @@ class HaarRows(Operator):
     @property
     def shape(self) -> tuple[int, int, int]:
         return len(self.scales), self.lighting.n_directions, self.scales.shape[1]
-
-    @property
-    def nbytes(self) -> int:
-        return self.starts.nbytes + self.places.nbytes + self.values.nbytes + self.scales.nbytes
 
     def rows(self, ids: Ids) -> Floats:
         some, m = self.take(ids), self.lighting.n_directions
@@ -63,7 +60,8 @@ class HaarRows(Operator):
         ids = np.asarray(ids)
         single = np.zeros((self.lighting.n_directions, len(ids)), np.float32)
         single[ids, np.arange(len(ids))] = 1
-        return np.ascontiguousarray(np.moveaxis(self._apply_same(single), 1, 2))
+        products = self._products(self._transformed(single)[None])
+        return np.ascontiguousarray(np.moveaxis(products, 1, 2))
 
     def relight(self, lighting: Floats) -> Floats:
         colours = self._transformed(lighting)
@@ -71,26 +69,19 @@ class HaarRows(Operator):
             return self._products(np.ascontiguousarray(colours.T[..., None]))[..., 0]
         return self._products(colours[None])[:, 0]
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return self._products(self._transformed(x)[None])
+    def _apply(self, x: Floats) -> Floats:
+        return self._products(np.stack([self._transformed(x[:, c]) for c in range(x.shape[1])]))
 
-    def _apply_each(self, x: Floats) -> Floats:
-        return self._products(np.stack([self._transformed(x[:, c]) for c in range(3)]))
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {name: getattr(self, name) for name in ("starts", "places", "values", "scales")}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        starts, places, values, scales = (arrays[n] for n in ("starts", "places", "values", "scales"))
-        if scales.shape[1] not in (1, 3) or places.shape != values.shape or values.dtype != np.float16:
+    def check(self) -> None:
+        fit = self.places.shape == self.values.shape and self.values.dtype == np.float16
+        if self.scales.shape[1] not in (1, 3) or not fit:
             raise ValueError("wavelet coefficients and their vertices do not fit together")
         # a wrong list would read beyond the lighting's coefficients
-        matrix = scipy.sparse.csr_array((places, places, starts), shape=(scales.size, lighting.n_directions))
+        lists = (self.places, self.places, self.starts)
+        matrix = scipy.sparse.csr_array(lists, shape=(self.scales.size, self.lighting.n_directions))
         matrix.check_format(full_check=True)
         if not matrix.has_canonical_format:
             raise ValueError("wavelet coefficients are not in order")
-        return cls(starts, places, values, scales, lighting)
 
     def take(self, source: Ids) -> HaarRows:
         channels = self.scales.shape[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -11,11 +11,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.ragged import select_rows
+from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
-from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
-
-_ELEMENTS = 1 << 15  # at a time; each has up to 40 dense ones
 
 
 @dataclass(frozen=True)
@@ -32,6 +30,8 @@ class Interpolated(Operator):
     """
 
     kind: ClassVar[str] = "interpolated"
+    by_row: ClassVar[tuple[str, ...]] = ("weights",)
+    element_block: ClassVar[int] = 1 << 15  # each has up to 40 dense ones
     dense: Operator
     weights: scipy.sparse.csr_array
 
@@ -53,10 +53,6 @@ class Interpolated(Operator):
     def columns(self, ids: Ids) -> Floats:
         return self._interpolate(self.dense.columns(ids))
 
-    def elements(self, ids: Ids, texels: Ids) -> Floats:
-        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
-        return np.concatenate([self._elements(ids[b], texels[b]) for b in blocks])
-
     def _elements(self, ids: Ids, texels: Ids) -> Floats:
         element, dense, weights = row_entries(self.weights, ids)
         return summed_entries(element, weights, self.dense.elements(dense, texels[element]), len(ids))
@@ -75,9 +71,6 @@ class Interpolated(Operator):
         """Values (n_dense, ...) at all points."""
         flat = self.weights @ dense.reshape(len(dense), math.prod(dense.shape[1:]))
         return flat.reshape(len(flat), *dense.shape[1:])
-
-    def take(self, ids: Ids) -> Interpolated:
-        return replace(self, weights=self.weights[ids])
 
     def arrays(self) -> dict[str, NDArray[Any] | Operator]:
         return {"dense": self.dense, **sparse_to_arrays("weights", self.weights)}

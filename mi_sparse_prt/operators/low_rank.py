@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
-_ELEMENTS = 1 << 15  # at a time
-
 
 @dataclass(frozen=True)
 class LowRank(Operator):
@@ -26,6 +24,7 @@ class LowRank(Operator):
     """
 
     kind: ClassVar[str] = "low_rank"
+    element_block: ClassVar[int] = 1 << 15
     left: tuple[NDArray[np.float32], ...]
     right: tuple[NDArray[np.float32], ...]
 
@@ -42,36 +41,27 @@ class LowRank(Operator):
     def nbytes(self) -> int:
         return sum(factor.nbytes for factor in (*self.left, *self.right))
 
+    @property
+    def _factors(self) -> list[tuple[Floats, Floats]]:
+        """Both factors of each channel."""
+        return list(zip(self.left, self.right, strict=True))
+
     def rows(self, ids: Ids) -> Floats:
-        channels = [a[ids] @ b for a, b in zip(self.left, self.right, strict=True)]
+        channels = [a[ids] @ b for a, b in self._factors]
         return np.stack(channels, axis=-1) if len(channels) > 1 else channels[0][..., None]
 
     def columns(self, ids: Ids) -> Floats:
-        return np.stack([a @ b[:, ids] for a, b in zip(self.left, self.right, strict=True)], axis=-1)
+        return np.stack([a @ b[:, ids] for a, b in self._factors], axis=-1)
 
-    def elements(self, ids: Ids, texels: Ids) -> Floats:
-        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
-        pairs = list(zip(self.left, self.right, strict=True))
-        return np.concatenate(
-            [
-                np.stack([np.einsum("mr,rm->m", a[ids[s]], b[:, texels[s]]) for a, b in pairs], axis=1)
-                for s in blocks
-            ]
-        )
+    def _elements(self, ids: Ids, texels: Ids) -> Floats:
+        channels = [np.einsum("mr,rm->m", a[ids], b[:, texels]) for a, b in self._factors]
+        return np.stack(channels, axis=1)
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return np.stack([a @ (b @ x) for a, b in zip(self.left, self.right, strict=True)], axis=1)
+    def _apply(self, x: Floats) -> Floats:
+        return np.stack([a @ (b @ x[:, c]) for c, (a, b) in enumerate(self._factors)], axis=1)
 
-    def _apply_each(self, x: Floats) -> Floats:
-        channels = zip(self.left, self.right, np.moveaxis(x, 1, 0), strict=True)
-        return np.stack([a @ (b @ light) for a, b, light in channels], axis=1)
-
-    def _adjoint_same(self, y: Floats) -> Floats:
-        return np.stack([b.T @ (a.T @ y) for a, b in zip(self.left, self.right, strict=True)], axis=1)
-
-    def _adjoint_each(self, y: Floats) -> Floats:
-        channels = zip(self.left, self.right, np.moveaxis(y, 1, 0), strict=True)
-        return np.stack([b.T @ (a.T @ weights) for a, b, weights in channels], axis=1)
+    def _adjoint(self, y: Floats) -> Floats:
+        return np.stack([b.T @ (a.T @ y[:, c]) for c, (a, b) in enumerate(self._factors)], axis=1)
 
     def take(self, ids: Ids) -> LowRank:
         return replace(self, left=tuple(left[ids] for left in self.left))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, unpack
-from mi_sparse_prt.core.block_products import multiply_converted
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator, multiply_converted
 
 FIXED_POINT = 65535.0  # mean cosines in [0, 1] as 16-bit fixed point: an absolute error of 8e-6
 
@@ -29,16 +28,15 @@ class MeanCosine(Operator):
     """
 
     kind: ClassVar[str] = "mean_cosine"
+    stored: ClassVar[tuple[str, ...]] = ("fixed",)
+    file_names: ClassVar[dict[str, str]] = {"fixed": "mean_cosine"}
+    by_row: ClassVar[tuple[str, ...]] = ("fixed",)
     fixed: NDArray[np.uint16]
     lighting: CubemapLighting
 
     @property
     def shape(self) -> tuple[int, int, int]:
         return len(self.fixed), self.lighting.n_directions, 1
-
-    @property
-    def nbytes(self) -> int:
-        return self.fixed.nbytes
 
     def rows(self, ids: Ids) -> Floats:
         return (self.fixed[ids] * self._weights())[..., None]
@@ -54,26 +52,17 @@ class MeanCosine(Operator):
     def elements(self, ids: Ids, texels: Ids) -> Floats:
         return (self.fixed[ids, texels] * self._weights()[texels])[:, None]
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return multiply_converted(self.fixed, x * self._weights()[:, None])[:, None]
+    def _apply(self, x: Floats) -> Floats:
+        return multiply_converted(self.fixed, x[:, 0] * self._weights()[:, None])[:, None]
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> MeanCosine:
         fixed = self.fixed.copy()
         fixed[points] *= unpack(open, fixed.shape[1])
         return replace(self, fixed=fixed)
 
-    def take(self, ids: Ids) -> MeanCosine:
-        return replace(self, fixed=self.fixed[ids])
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {"mean_cosine": self.fixed}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        fixed = arrays["mean_cosine"]
-        if fixed.shape[1:] != (lighting.n_directions,):
-            raise ValueError(f"mean cosines {fixed.shape} do not fit the lighting")
-        return cls(fixed, lighting)
+    def check(self) -> None:
+        if self.fixed.shape[1:] != (self.lighting.n_directions,):
+            raise ValueError(f"mean cosines {self.fixed.shape} do not fit the lighting")
 
     def _weights(self) -> Floats:
         return self.lighting.solid_angles / np.float32(np.pi * FIXED_POINT)

@@ -1,14 +1,15 @@
 """The contract of every linear factor of T: what can be asked of it, whatever it keeps.
 
 Rows belong to points, columns to elements of the emission space. An operator of one channel stands for three that are
-alike. A new representation is a subclass with ``shape``, ``nbytes``, ``rows``, ``take``, ``arrays`` and
-``from_arrays``; the rest follows, and is overridden where a representation knows a quicker way.
+alike. A new representation is a dataclass with ``shape`` and ``rows`` that says which of its fields are stored, and
+which of these have a row for each point; the rest follows, and is overridden where it knows a quicker way.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar, Self
 
@@ -25,6 +26,7 @@ ROWS = 2048  # expanded at a time
 CACHED_ROWS = 256  # expanded at a time where some of them stay in the cache until they are used
 
 
+@dataclass(frozen=True)
 class Operator(ABC):
     """A linear factor of T, (rows, n_directions, channels).
 
@@ -32,37 +34,48 @@ class Operator(ABC):
     ----------
     kind : str
         Its name in files.
+    stored : tuple of str
+        Fields that files keep, arrays or operators; all but ``lighting``, the emission space.
+    file_names : dict of str to str
+        Names of fields in files, where these are others.
+    by_row : tuple of str
+        Stored fields that have an entry for each row.
     dark_below_horizon : bool
         Whether no element below the horizon of its point can be other than 0.
+    element_block : int
+        Elements that are looked up at a time.
     """
 
     kind: ClassVar[str]
+    stored: ClassVar[tuple[str, ...]] = ()
+    file_names: ClassVar[dict[str, str]] = {}
+    by_row: ClassVar[tuple[str, ...]] = ()
     dark_below_horizon: ClassVar[bool] = False
+    element_block: ClassVar[int] = ROWS
 
     @property
     @abstractmethod
     def shape(self) -> tuple[int, int, int]:
         """(rows, n_directions, channels); channels is 1 or 3."""
 
-    @property
-    @abstractmethod
-    def nbytes(self) -> int:
-        """Bytes that it keeps in memory."""
-
     @abstractmethod
     def rows(self, ids: Ids) -> Floats:
         """Rows (len(ids), n_directions, channels)."""
 
-    @abstractmethod
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps in memory."""
+        return sum(getattr(self, name).nbytes for name in self.stored)
+
     def take(self, ids: Ids) -> Operator:
         """The operator of some rows, in this order."""
+        return replace(self, **{name: getattr(self, name)[ids] for name in self.by_row})
 
-    @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any] | Operator]:
         """All that it is made of but the emission space; operators may be nested."""
+        return {self.file_names.get(name, name): getattr(self, name) for name in self.stored}
 
     @classmethod
-    @abstractmethod
     def from_arrays(cls, arrays: dict[str, Any], lighting: Any) -> Self:
         """From what ``arrays`` gave.
 
@@ -71,6 +84,15 @@ class Operator(ABC):
         ValueError, KeyError
             If these do not fit together.
         """
+        own = {name: arrays[cls.file_names.get(name, name)] for name in cls.stored}
+        if any(field.name == "lighting" for field in fields(cls)):
+            own["lighting"] = lighting
+        operator = cls(**own)
+        operator.check()
+        return operator
+
+    def check(self) -> None:  # noqa: B027 - most have something to check, not all
+        """Raise ValueError if what came from a file does not fit together."""
 
     @property
     def edges(self) -> Bits | None:
@@ -85,8 +107,13 @@ class Operator(ABC):
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
         """Elements (k, channels) at rows and texels, (k,) each."""
-        blocks = [slice(a, a + ROWS) for a in range(0, max(len(ids), 1), ROWS)]
-        return np.concatenate([self.rows(ids[b])[np.arange(len(ids[b])), texels[b]] for b in blocks])
+        size = self.element_block
+        blocks = [slice(a, a + size) for a in range(0, max(len(ids), 1), size)]
+        return np.concatenate([self._elements(ids[b], texels[b]) for b in blocks])
+
+    def _elements(self, ids: Ids, texels: Ids) -> Floats:
+        """``elements`` of one block."""
+        return self.rows(ids)[np.arange(len(ids)), texels]
 
     def apply(self, x: Floats) -> Floats:
         """Products with vectors.
@@ -100,13 +127,7 @@ class Operator(ABC):
         -------
         (rows, channels, k) or (rows, 3, k) float32
         """
-        x = np.asarray(x, np.float32)
-        if x.ndim == 2:
-            return self._apply_same(x)
-        if self.shape[2] == 1:  # three channels that are alike: all vectors side by side
-            m, channels, k = x.shape
-            return self._apply_same(x.reshape(m, channels * k)).reshape(-1, channels, k)
-        return self._apply_each(x)
+        return self._by_channel(self._apply, x)
 
     def adjoint(self, y: Floats) -> Floats:
         """Products of the transpose with vectors.
@@ -120,13 +141,19 @@ class Operator(ABC):
         -------
         (n_directions, channels, k) or (n_directions, 3, k) float32
         """
-        y = np.asarray(y, np.float32)
-        if y.ndim == 2:
-            return self._adjoint_same(y)
-        if self.shape[2] == 1:
-            n, channels, k = y.shape
-            return self._adjoint_same(y.reshape(n, channels * k)).reshape(-1, channels, k)
-        return self._adjoint_each(y)
+        return self._by_channel(self._adjoint, y)
+
+    def _by_channel(self, multiply: Callable[[Floats], Floats], vectors: Floats) -> Floats:
+        """Products (..., channels, k) by a function that takes each channel's own vectors (..., channels, k)."""
+        vectors = np.asarray(vectors, np.float32)
+        channels = self.shape[2]
+        if vectors.ndim == 2:
+            n, k = vectors.shape
+            return multiply(np.broadcast_to(vectors[:, None], (n, channels, k)))
+        if channels == 1:  # three channels that are alike: all vectors side by side
+            n, colours, k = vectors.shape
+            return multiply(vectors.reshape(n, 1, colours * k)).reshape(-1, colours, k)
+        return multiply(vectors)
 
     def relight(self, lighting: Floats) -> Floats:
         """Products (rows, 3) with a lighting L (n_directions, 3)."""
@@ -168,14 +195,13 @@ class Operator(ABC):
             total += self.dense_columns(some, room) * sign
         return total
 
-    def _apply_same(self, x: Floats) -> Floats:
-        """Products (rows, channels, k) with vectors (n_directions, k), by blocks of rows."""
-        rows, _, channels = self.shape
-        result = np.empty((rows, channels, x.shape[1]), np.float32)
+    def _apply(self, x: Floats) -> Floats:
+        """Products (rows, channels, k) with vectors (n_directions, channels, k), by blocks of rows."""
+        result = np.empty((self.shape[0], *x.shape[1:]), np.float32)
 
         def multiply(some: NDArray[np.int64], made: Floats) -> None:
-            for c in range(channels):
-                result[some[0] : some[-1] + 1, c] = made[..., c] @ x
+            for c in range(x.shape[1]):
+                result[some[0] : some[-1] + 1, c] = made[..., c] @ x[:, c]
 
         for _ in run_overlapped(
             partial(multiply, some, self.rows(some)) for some in self._blocks(CACHED_ROWS)
@@ -183,22 +209,7 @@ class Operator(ABC):
             pass
         return result
 
-    def _apply_each(self, x: Floats) -> Floats:
-        """Products (rows, 3, k) with vectors (n_directions, 3, k) of each channel."""
-        result = np.empty((self.shape[0], 3, x.shape[2]), np.float32)
-        for some in self._blocks(CACHED_ROWS):
-            made = self.rows(some)
-            for c in range(3):
-                result[some, c] = made[..., c] @ x[:, c]
-        return result
-
-    def _adjoint_same(self, y: Floats) -> Floats:
-        return self._adjoint_by_rows(np.broadcast_to(y[:, None], (len(y), self.shape[2], y.shape[1])))
-
-    def _adjoint_each(self, y: Floats) -> Floats:
-        return self._adjoint_by_rows(y)
-
-    def _adjoint_by_rows(self, y: Floats) -> Floats:
+    def _adjoint(self, y: Floats) -> Floats:
         """Products (n_directions, channels, k) of the transpose with vectors (rows, channels, k)."""
         result = np.zeros((self.shape[1], *y.shape[1:]), np.float32)
         for some in self._blocks(ROWS):
@@ -226,6 +237,7 @@ class Masked(Operator):
     """
 
     kind: ClassVar[str] = "masked"
+    stored: ClassVar[tuple[str, ...]] = ("operator", "points", "open")
     operator: Operator
     points: NDArray[np.int64]
     open: Bits
@@ -259,19 +271,23 @@ class Masked(Operator):
         open = self.open[np.searchsorted(self.points, np.asarray(ids)[here])]
         return replace(self, operator=self.operator.take(ids), points=here, open=open)
 
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {"operator": self.operator, "points": self.points, "open": self.open}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: Any) -> Self:
-        operator, points, open = (arrays[name] for name in ("operator", "points", "open"))
-        n, m, _ = operator.shape
-        if open.shape != (len(points), -(-m // BITS)) or (np.diff(points, prepend=-1, append=n) <= 0).any():
+    def check(self) -> None:
+        n, m, _ = self.operator.shape
+        ascending = (np.diff(self.points, prepend=-1, append=n) > 0).all()
+        if self.open.shape != (len(self.points), -(-m // BITS)) or not ascending:
             raise ValueError("masks and the rows that they are of do not fit together")
-        return cls(operator, points, open)
 
     def _kept(self, rows: Ids, texels: Ids) -> NDArray[np.bool_]:
         """Whether elements at rows and texels, (m,) each, are kept."""
         result, some = np.ones(len(rows), np.bool_), np.isin(rows, self.points)
         result[some] = bits_at(self.open, np.searchsorted(self.points, rows[some]), texels[some])
         return result
+
+
+def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:
+    """``matrix @ vectors``; the matrix (n, m) holds small numbers, converted to float32 on the way."""
+    product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
+    block = 2048  # rows at a time
+    for a in range(0, len(matrix), block):
+        product[a : a + block] = matrix[a : a + block].astype(np.float32) @ vectors
+    return product

@@ -10,9 +10,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
-from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,10 @@ class SparseRows(Operator):
     def columns(self, ids: Ids) -> Floats:
         return np.stack([matrix[:, np.asarray(ids)].toarray() for matrix in self.matrices], axis=-1)
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return np.stack([matrix @ x for matrix in self.matrices], axis=1)
-
-    def _apply_each(self, x: Floats) -> Floats:
+    def _apply(self, x: Floats) -> Floats:
         return np.stack([matrix @ x[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
 
-    def _adjoint_by_rows(self, y: Floats) -> Floats:
+    def _adjoint(self, y: Floats) -> Floats:
         return np.stack([matrix.T @ y[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
 
     def take(self, ids: Ids) -> SparseRows:

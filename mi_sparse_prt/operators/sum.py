@@ -48,17 +48,11 @@ class Sum(Operator):
     def relight(self, lighting: Floats) -> Floats:
         return add(term.relight(lighting) for term in self.terms)
 
-    def _apply_same(self, x: Floats) -> Floats:
-        return np.moveaxis(add(np.moveaxis(term.apply(x), 1, 2) for term in self.terms), 2, 1)
+    def apply(self, x: Floats) -> Floats:
+        return _add_channels([term.apply(x) for term in self.terms])
 
-    def _apply_each(self, x: Floats) -> Floats:
-        return add(term.apply(x) for term in self.terms)
-
-    def _adjoint_same(self, y: Floats) -> Floats:
-        return np.moveaxis(add(np.moveaxis(term.adjoint(y), 1, 2) for term in self.terms), 2, 1)
-
-    def _adjoint_each(self, y: Floats) -> Floats:
-        return add(term.adjoint(y) for term in self.terms)
+    def adjoint(self, y: Floats) -> Floats:
+        return _add_channels([term.adjoint(y) for term in self.terms])
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> Sum:
         return Sum(tuple(term.masked(points, open) for term in self.terms))
@@ -86,3 +80,8 @@ def add(arrays: Any) -> Floats:
         return larger
 
     return reduce(added, arrays)
+
+
+def _add_channels(products: list[Floats]) -> Floats:
+    """``add`` of products (..., 1 or 3, k)."""
+    return np.moveaxis(add(np.moveaxis(product, 1, 2) for product in products), 2, 1)

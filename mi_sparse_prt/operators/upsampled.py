@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.block_products import multiply_converted
+from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_to_arrays
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.interpolated import row_entries, summed_entries
-from mi_sparse_prt.operators.operator import Floats, Ids, Operator
-from mi_sparse_prt.operators.sparse_arrays import sparse_from_arrays, sparse_to_arrays
-
-_ELEMENTS = 1 << 15  # at a time; each has four coarse ones
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator, multiply_converted
 
 
 @dataclass(frozen=True)
@@ -32,6 +29,8 @@ class Upsampled(Operator):
     """
 
     kind: ClassVar[str] = "upsampled"
+    by_row: ClassVar[tuple[str, ...]] = ("density",)
+    element_block: ClassVar[int] = 1 << 15  # each has four coarse ones
     density: NDArray[np.float16]
     upsampling: scipy.sparse.csr_array
     lighting: CubemapLighting
@@ -57,28 +56,19 @@ class Upsampled(Operator):
             [(weights[:, needed] @ density[..., c].T).T for c in range(density.shape[2])], axis=-1
         )
 
-    def elements(self, ids: Ids, texels: Ids) -> Floats:
-        blocks = [slice(a, a + _ELEMENTS) for a in range(0, max(len(ids), 1), _ELEMENTS)]
-        return np.concatenate([self._elements(ids[b], texels[b]) for b in blocks])
-
     def _elements(self, ids: Ids, texels: Ids) -> Floats:
         element, coarse, weights = row_entries(self.upsampling, texels)
         density = self.density[ids[element], coarse].astype(np.float32)  # [entry, channel]
         fine = summed_entries(element, weights, density, len(ids))
         return fine * self.lighting.solid_angles[texels][:, None]
 
-    def _apply_same(self, x: Floats) -> Floats:
-        coarse = self.upsampling.T @ (x * self.lighting.solid_angles[:, None])  # [coarse, vector]
-        channels = [multiply_converted(self.density[..., c], coarse) for c in range(self.density.shape[2])]
-        return np.stack(channels, axis=1)
-
-    def _apply_each(self, x: Floats) -> Floats:
+    def _apply(self, x: Floats) -> Floats:
         light = x * self.lighting.solid_angles[:, None, None]
-        coarse = [self.upsampling.T @ light[:, c] for c in range(3)]  # of [coarse, vector]
-        return np.stack([multiply_converted(self.density[..., c], coarse[c]) for c in range(3)], axis=1)
-
-    def take(self, ids: Ids) -> Upsampled:
-        return replace(self, density=self.density[ids])
+        channels = [
+            multiply_converted(self.density[..., c], self.upsampling.T @ light[:, c])
+            for c in range(self.density.shape[2])
+        ]
+        return np.stack(channels, axis=1)
 
     def arrays(self) -> dict[str, NDArray[Any] | Operator]:
         return {"density": self.density, **sparse_to_arrays("upsampling", self.upsampling)}

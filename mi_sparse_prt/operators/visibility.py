@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numba
 import numpy as np
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+
+#: Bits of texels; where those that are seen in part begin in two lists; these texels, and their shares.
+SeenTexels = tuple[Bits, NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class Visibility(Operator):
     """
 
     kind: ClassVar[str] = "visibility"
+    stored: ClassVar[tuple[str, ...]] = ("bits", "normals")
+    file_names: ClassVar[dict[str, str]] = {"bits": "visibility"}
+    by_row: ClassVar[tuple[str, ...]] = stored
     dark_below_horizon: ClassVar[bool] = True
     bits: NDArray[np.uint32]
     normals: NDArray[np.float32]
@@ -41,17 +47,18 @@ class Visibility(Operator):
         return self.bits.nbytes
 
     @property
-    def listed(self) -> tuple[NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]:
-        """Texels that are seen in part, as ``FractionalVisibility`` lists them: none."""
-        return np.zeros(len(self.bits) + 1, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+    def seen(self) -> SeenTexels:
+        """Bits, and no texels that are seen in part (``FractionalVisibility.seen``)."""
+        starts = np.zeros(len(self.bits) + 1, np.int64)
+        return self.bits, starts, np.zeros(0, np.uint16), np.zeros(0, np.uint8)
 
     @property
     def edges(self) -> Bits | None:
         return self.bits
 
     def rows(self, ids: Ids) -> Floats:
-        beams = np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
-        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), beams)[..., None]
+        weighted = np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
+        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), weighted)[..., None]
 
     def columns(self, ids: Ids) -> Floats:
         return self.dense_columns(ids, np.empty((len(self.bits), len(ids)), np.float32))[..., None]
@@ -59,8 +66,8 @@ class Visibility(Operator):
     def dense_columns(self, texels: Ids, out: Floats) -> Floats:
         texels = np.asarray(texels)
         words, shifts = (np.asarray(f(texels, BITS), np.uint32) for f in (np.floor_divide, np.mod))
-        beams = np.ascontiguousarray((self.lighting.directions[texels] * self._weights()[texels, None]).T)
-        _expand_columns(self.bits, self.normals, words, shifts, beams, out)
+        weighted = np.ascontiguousarray((self.lighting.directions[texels] * self._weights()[texels, None]).T)
+        _expand_columns(self.bits, self.normals, words, shifts, weighted, out)
         return out
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
@@ -85,22 +92,13 @@ class Visibility(Operator):
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
         texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
         power = self._weights()[texels]
-        beams = np.moveaxis(self.lighting.directions[texels], 2, 1) * power[:, None]  # [word, xyz, bit]
+        weighted = np.moveaxis(self.lighting.directions[texels], 2, 1) * power[:, None]  # [word, xyz, bit]
         return _combine(
-            self.bits, self.normals, np.asarray(words, np.int64), np.ascontiguousarray(beams), signs
+            self.bits, self.normals, np.asarray(words, np.int64), np.ascontiguousarray(weighted), signs
         )
 
-    def take(self, ids: Ids) -> Visibility:
-        return replace(self, bits=self.bits[ids], normals=self.normals[ids])
-
-    def arrays(self) -> dict[str, NDArray[Any] | Operator]:
-        return {"visibility": self.bits, "normals": self.normals}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], lighting: CubemapLighting) -> Self:
-        bits, normals = arrays["visibility"], arrays["normals"]
-        check_bits(bits, normals, lighting)
-        return cls(bits, normals, lighting)
+    def check(self) -> None:
+        check_bits(self.bits, self.normals, self.lighting)
 
     def _weights(self) -> Floats:
         return self.lighting.solid_angles / np.float32(np.pi)
@@ -115,18 +113,18 @@ def check_bits(bits: Bits, normals: Floats, lighting: CubemapLighting) -> None:
 
 @numba.njit(parallel=True, cache=True)
 def _expanded_rows(
-    bits: NDArray[np.uint32], normals: Floats, ids: NDArray[np.int64], beams: Floats
+    bits: NDArray[np.uint32], normals: Floats, ids: NDArray[np.int64], weighted: Floats
 ) -> Floats:
-    """Elements (n, m) of rows ``ids``; beams (3, m) are directions times power."""
-    result = np.zeros((len(ids), beams.shape[1]), np.float32)
+    """Elements (n, m) of rows ``ids``; weighted (3, m) are directions times power."""
+    result = np.zeros((len(ids), weighted.shape[1]), np.float32)
     for i in numba.prange(len(ids)):
         nx, ny, nz = normals[ids[i], 0], normals[ids[i], 1], normals[ids[i], 2]
         for word in range(bits.shape[1]):
             mask = bits[ids[i], word]
             if mask == 0:
                 continue
-            for j in range(word * 32, min(word * 32 + 32, beams.shape[1])):
-                cosine = nx * beams[0, j] + ny * beams[1, j] + nz * beams[2, j]
+            for j in range(word * 32, min(word * 32 + 32, weighted.shape[1])):
+                cosine = nx * weighted[0, j] + ny * weighted[1, j] + nz * weighted[2, j]
                 seen = np.float32((mask >> np.uint32(j % 32)) & np.uint32(1))
                 result[i, j] = max(cosine, np.float32(0)) * seen
     return result
@@ -160,23 +158,23 @@ def _expand_columns(
     normals: Floats,
     words: NDArray[np.uint32],
     shifts: NDArray[np.uint32],
-    beams: Floats,
+    weighted: Floats,
     result: Floats,
 ) -> None:
-    """Elements (n, m) at bits ``shifts`` of ``words``; beams (3, m) are directions times power."""
+    """Elements (n, m) at bits ``shifts`` of ``words``; weighted (3, m) are directions times power."""
     for i in numba.prange(len(bits)):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         for j in range(len(words)):
-            light = nx * beams[0, j] + ny * beams[1, j] + nz * beams[2, j]
+            light = nx * weighted[0, j] + ny * weighted[1, j] + nz * weighted[2, j]
             seen = (bits[i, words[j]] >> shifts[j]) & np.uint32(1)
             result[i, j] = max(light, np.float32(0)) * np.float32(seen)
 
 
 @numba.njit(parallel=True, fastmath={"contract"}, cache=True)
 def _combine(
-    bits: NDArray[np.uint32], normals: Floats, words: NDArray[np.int64], beams: Floats, signs: Floats
+    bits: NDArray[np.uint32], normals: Floats, words: NDArray[np.int64], weighted: Floats, signs: Floats
 ) -> Floats:
-    """Sums (n, k) over words of the elements at their bits, with signs (words, k); beams (words, 3, k)."""
+    """Sums (n, k) over words of the elements at their bits, with signs (words, k); weighted (words, 3, k)."""
     result = np.zeros((len(bits), signs.shape[1]), np.float32)
     for i in numba.prange(len(bits)):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -185,7 +183,7 @@ def _combine(
             if mask == 0:
                 continue
             for k in range(signs.shape[1]):
-                light = nx * beams[g, 0, k] + ny * beams[g, 1, k] + nz * beams[g, 2, k]
+                light = nx * weighted[g, 0, k] + ny * weighted[g, 1, k] + nz * weighted[g, 2, k]
                 seen = signs[g, k] * np.float32((mask >> np.uint32(k)) & np.uint32(1))
                 result[i, k] += max(light, np.float32(0)) * seen
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -130,15 +131,10 @@ class MeshVertices(mi.Sensor):
         return ray, dr.select(active, mi.Spectrum(1), 0)
 
     def sample_ray_differential(
-        self,
-        time: mi.Float,
-        wavelength_sample: mi.Float,
-        position_sample: mi.Point2f,
-        aperture_sample: mi.Point2f,
-        active: mi.Mask = True,
+        self, *arguments: Any, **named: Any
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """As ``sample_ray``; a vertex has no neighbours on the film, so there are no differentials."""
-        ray, weight = self.sample_ray(time, wavelength_sample, position_sample, aperture_sample, active)
+        ray, weight = self.sample_ray(*arguments, **named)
         return mi.RayDifferential3f(ray), weight
 
     def radiance(self, image: mi.TensorXf) -> NDArray[np.float32]:

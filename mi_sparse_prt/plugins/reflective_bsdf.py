@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -57,23 +59,11 @@ class ReflectiveBSDF(mi.BSDF):
         value, density = self.reflect(context, si, wo, active)
         return dr.select(active, value, 0), dr.select(active, density, 0)
 
-    def eval(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Color3f:
-        return self.eval_pdf(context, si, wo, active)[0]
+    def eval(self, *arguments: Any, **named: Any) -> mi.Color3f:
+        return self.eval_pdf(*arguments, **named)[0]
 
-    def pdf(
-        self,
-        context: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Float:
-        return self.eval_pdf(context, si, wo, active)[1]
+    def pdf(self, *arguments: Any, **named: Any) -> mi.Float:
+        return self.eval_pdf(*arguments, **named)[1]
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
         return self.diffuse.eval(si, active)

@@ -227,13 +227,7 @@ def render(
     PrtError
         If the scene has no such sensor, or the matrix belongs to another scene.
     """
-    if isinstance(sensor, int):
-        sensors = scene.mitsuba.sensors()
-        if not -len(sensors) <= sensor < len(sensors):
-            raise PrtError(
-                f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
-            )
-        sensor = sensors[sensor]
+    sensor = scene.sensor(sensor)
     transport = transport.for_scene(scene)
     at_pixels = transport.measurement.image
     if at_pixels is not None and at_pixels != tuple(int(n) for n in sensor.film().crop_size())[::-1]:

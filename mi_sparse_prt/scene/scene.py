@@ -23,8 +23,7 @@ from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene
 from mi_sparse_prt.scene.surfaces import read_surfaces
-from mi_sparse_prt.scene.triangle_keys import triangle_keys
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, triangle_keys
 
 
 @dataclass(frozen=True)
@@ -91,10 +90,7 @@ class Scene:
         self.positions = np.concatenate([m.positions for m in meshes])
         self.normals = np.concatenate([m.normals for m in meshes])
 
-        low, high = (
-            self.positions.min(axis=0).astype(np.float64),
-            self.positions.max(axis=0).astype(np.float64),
-        )
+        low, high = (f(self.positions, axis=0).astype(np.float64) for f in (np.min, np.max))
         self.centre: NDArray[np.float64] = (low + high) / 2
         self.scale = float(1 / np.max(high - low))
         self.normalised_positions = ((self.positions.astype(np.float64) - self.centre) * self.scale).astype(
@@ -160,6 +156,23 @@ class Scene:
                 self.mitsuba.shapes(), self._surfaces, self.materials, strict=True
             )
         ]
+
+    def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
+        """One of the scene's own cameras by its number; a sensor is passed on.
+
+        Raises
+        ------
+        PrtError
+            If there is no such number.
+        """
+        if not isinstance(sensor, int):
+            return sensor
+        sensors = self.mitsuba.sensors()
+        if not -len(sensors) <= sensor < len(sensors):
+            raise PrtError(
+                f"the scene {self.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
+            )
+        return sensors[sensor]
 
     @property
     def n_vertices(self) -> int:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.random_keys import hash_rows, mix
+
 
 @dataclass
 class TriangleMesh:
@@ -73,3 +75,20 @@ def unique_rows(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         _, code = np.unique(code * (value.max(initial=0) + 1) + value, return_inverse=True)
     _, first = np.unique(code, return_index=True)
     return first, code
+
+
+def triangle_keys(mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64) -> NDArray[np.uint64]:
+    """(t,) hash of each triangle, whatever their order: its corners, the smallest key first, and material (`seed`)."""
+    corners = vertex_keys
+    if mesh.texcoords is not None:
+        corners = hash_rows(mesh.texcoords, corners)
+    for _, values in sorted(mesh.vertex_attributes.items()):
+        corners = hash_rows(values, corners)
+    keys = corners[mesh.triangles]  # [triangle, corner]
+    order = (np.argmin(keys, axis=1)[:, None] + np.arange(3)) % 3
+    state = np.full(len(keys), seed)
+    for corner in np.take_along_axis(keys, order, axis=1).T:
+        state = mix(state ^ corner)
+    for _, values in sorted(mesh.face_attributes.items()):
+        state = hash_rows(values, state)
+    return state

@@ -1,6 +1,6 @@
 """Haar wavelets of cubemaps and rows truncated in them: against explicit matrices and sorted coefficients."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,12 +10,44 @@ from tqdm.auto import tqdm
 import mi_sparse_prt as prt
 from mi_sparse_prt.compression.compress import compress
 from mi_sparse_prt.compression.haar_truncation import haar_mesh, haar_part, truncate
-from mi_sparse_prt.emission.haar import haar, haar_squares, inverse_haar
+from mi_sparse_prt.emission.haar import haar, inverse_haar
 from mi_sparse_prt.operators.haar_rows import HaarRows
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.transport import LightTransport, MeshRange
 
 ROUNDED = 1e-3  # of float16 numbers, relative
+
+
+@dataclass(frozen=True)
+class HaarSquares:
+    """What each coefficient of a cubemap with n texels along a face's edge belongs to, all (6 n^2,) int64.
+
+    Attributes
+    ----------
+    face : 0 to 5
+    level : 0 to log2(n) - 1
+        Its squares are n / 2^level texels wide; 0 for a face's mean as well.
+    kind : 0 to 3
+        0 is a face's mean; see ``emission.haar`` for 1 to 3.
+    row, col : 0 to 2^level - 1
+        Of the square among those of its level.
+    """
+
+    face: np.ndarray
+    level: np.ndarray
+    kind: np.ndarray
+    row: np.ndarray
+    col: np.ndarray
+
+
+def haar_squares(resolution: int) -> HaarSquares:
+    """What all coefficients belong to, of a cubemap of ``resolution`` texels along a face's edge, a power of two."""
+    n = resolution
+    face, row, col = np.unravel_index(np.arange(6 * n * n), (6, n, n))
+    level = np.log2(np.maximum(np.maximum(row, col), 1)).astype(np.int64)
+    squares = 1 << level  # along an edge
+    down, across = (row >= squares).astype(np.int64), (col >= squares).astype(np.int64)
+    return HaarSquares(face, level, 2 * down + across, row - down * squares, col - across * squares)
 
 
 def explicit(n: int) -> np.ndarray:

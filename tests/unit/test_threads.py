@@ -7,11 +7,9 @@ import threading
 import time
 
 import numba
-import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from mi_sparse_prt.core.block_products import multiply_rows
 from mi_sparse_prt.core.threads import run_overlapped
 
 
@@ -57,14 +55,6 @@ def test_products_and_kernels_use_one_thread_meanwhile() -> None:
 
     (found,) = run_overlapped(tasks())
     assert found and set(found) == {1}
-
-
-@pytest.mark.parametrize("count", [0, 1, 16, 35])
-def test_rows_are_multiplied_in_their_order(count: int) -> None:
-    rng = np.random.default_rng(0)
-    rows, vectors = (rng.random(shape, np.float32) for shape in ((count, 20), (20, 3)))
-    found = multiply_rows(lambda ids: rows[ids][..., None], count, vectors, block=16)
-    np.testing.assert_allclose(found[..., 0], rows @ vectors, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "passive"), ("active", "active")])
