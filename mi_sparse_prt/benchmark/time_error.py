@@ -119,16 +119,17 @@ def time_against_error(
         known = replace(known, element_spp=reference_spp)
     reference = Reference(scene, lighting, progress, known)
     rays, _ = measure_direct(scene, lighting, RAY_REPEATS)
+    noise = reference.noise()
     direct_seconds = rays["seconds"]
-    brute = [
-        _point(spp, reference.time_paths(spp), direct_seconds, reference.relative_l2_of_paths(spp))
-        for spp in effort.brute_force_spps
-    ]
-    adjoint = [
-        _point(spp, reference.time_adjoint(spp), direct_seconds, reference.relative_l2_of_adjoint(spp))
-        for spp in effort.adjoint_spps
-    ]
-    curve = _curve(brute, direct_seconds)
+    ways = {
+        "brute_force": (effort.brute_force_spps, reference.time_paths, reference.relative_l2_of_paths),
+        "adjoint": (effort.adjoint_spps, reference.time_adjoint, reference.relative_l2_of_adjoint),
+    }
+    points = {
+        way: [_point(spp, seconds_at(spp), direct_seconds, error_at(spp)) for spp in spps]
+        for way, (spps, seconds_at, error_at) in ways.items()
+    }
+    curve = _curve(points["brute_force"], direct_seconds)
     report: dict[str, Any] = {
         **report_header(scene, lighting),
         "parameters": {"max_depth": MAX_DEPTH, "spp": effort.spp},
@@ -137,12 +138,9 @@ def time_against_error(
             "seconds": rays["bare_seconds"],
             "direct_seconds": direct_seconds,
         },
-        "reference_noise": {
-            name: value for name, value in reference.noise().items() if name != "standard_error"
-        },
-        "brute_force": brute,
+        "reference_noise": {name: noise[name] for name in ("total", "meshes")},
+        **points,
         "noise_of_one_path": curve.noise,
-        "adjoint": adjoint,
         "methods": {},
         "skipped": [],
     }

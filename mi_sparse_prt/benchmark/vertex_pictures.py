@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.shape_table import first_triangles
 
 COLORMAP = "viridis"
 SUBPIXELS = 3  # rays per pixel and axis
@@ -59,11 +60,7 @@ def vertex_picture(
     n = len(scene.positions)
     if v.shape != (n,):
         raise PrtError(f"values have the shape {v.shape}: give one for each of the {n} vertices, ({n},)")
-    sensors = scene.mitsuba.sensors()
-    if not -len(sensors) <= sensor < len(sensors):
-        raise PrtError(
-            f"the scene {scene.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
-        )
+    camera = scene.sensor(sensor)
     chosen = np.asarray([] if dots is None else dots, np.int64).reshape(-1)
     if len(chosen) and not (0 <= chosen.min() and chosen.max() < n):
         raise PrtError(
@@ -72,9 +69,9 @@ def vertex_picture(
     if width < 1:
         raise PrtError(f"width is {width}: give 1 pixel or more")
 
-    film = sensors[sensor].film().size()
+    film = camera.film().size()
     height = max(1, round(width * int(film.y) / int(film.x)))
-    rays = _rays(sensors[sensor], width, height)
+    rays = _rays(camera, width, height)
     hit = _Hits(scene, rays, int(film.x) / width)
 
     colours = np.ones((len(hit.valid), 3))  # [sample, rgb]
@@ -98,12 +95,11 @@ class _Hits:
 
     def __init__(self, scene: Scene, ray: mi.RayDifferential3f, film_pixels: float) -> None:
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
-        # one mesh of all triangles: the number of a primitive is that of the triangle
-        surface = _one_mesh(scene.positions, triangles)  # has to outlive what it is asked
-        hit = surface.ray_intersect_preliminary(mi.Ray3f(ray))
+        hit = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(ray))
         si = hit.compute_surface_interaction(mi.Ray3f(ray))
         self.valid = hit.is_valid().numpy()
-        self._corners = triangles[hit.prim_index.numpy()[self.valid]]  # [hit, corner]
+        triangle = first_triangles(scene.mitsuba).gather(hit.shape, hit.is_valid()) + hit.prim_index
+        self._corners = triangles[triangle.numpy()[self.valid]]  # [hit, corner]
         u, v = hit.prim_uv.numpy()[:, self.valid].astype(np.float64)
         self._barycentric = np.stack([1 - u - v, u, v], axis=1)
         self._origins, self._directions, self._points = (
@@ -138,16 +134,6 @@ def _rays(sensor: mi.Sensor, width: int, height: int) -> mi.RayDifferential3f:
     place = mi.Point2f(mi.Float(index - y * columns) + 0.5, mi.Float(y) + 0.5)
     ray, _ = sensor.sample_ray_differential(0, 0.5, place / mi.Point2f(columns, rows), mi.Point2f(0.5))
     return ray
-
-
-def _one_mesh(positions: NDArray[np.float32], triangles: NDArray[np.integer]) -> mi.Scene:
-    """A Mitsuba scene of one mesh."""
-    mesh = mi.Mesh("picture", len(positions), len(triangles))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ascontiguousarray(positions, np.float32).ravel()
-    parameters["faces"] = np.ascontiguousarray(triangles, np.uint32).ravel()
-    parameters.update()
-    return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
 def _range(values: NDArray[np.float64], vmin: float | None, vmax: float | None) -> tuple[float, float]:
