@@ -61,11 +61,8 @@ def draw_pixels() -> None:
         seconds, size = transport.report["seconds"]["total"], transport.nbytes / 1e6
         print(f"{name}: {transport.shape}, {seconds:.1f} s, {size:.0f} MB")
         images[f"rows at {name}"] = prt.render(scene, transport, texels, spp=64, progress=False)
-    n = lighting.resolution
-    sky = {"type": "cubemap", "data": mi.TensorXf(texels.reshape(6, n, n, 3)), "resolution": n}
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.unlit_shapes())}
-    lit = mi.load_dict({"type": "scene", **shapes, "sky": sky}, optimize=False)
-    images["Mitsuba path"], noise = reference(lit, scene.mitsuba.sensors()[0])
+    with lighting.scene_lit_by(texels, scene) as lit:
+        images["Mitsuba path"], noise = reference(lit, scene.sensor(0))
     for name in ("rows at vertices", "rows at pixels"):
         compare(name, images[name], images["Mitsuba path"], noise)
     draw(images, np.percentile(images["Mitsuba path"], 98), IMAGES / "pixels.jpg")

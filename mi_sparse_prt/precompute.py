@@ -365,7 +365,7 @@ def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
     """What the matrix was made from, for the report."""
     return {
         "seed": settings.seed,
-        "parameters": asdict(replace(settings, indirect_resolution=settings.coarse.resolution))
+        "parameters": asdict(replace(settings, indirect_resolution=settings.element_resolution))
         | {"terms": problem.reflection.terms},
         "scene": problem.scene.summary,
         "versions": versions(),

@@ -89,6 +89,7 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
     return LightTransport(
         lighting,
         attributes["basis"],
+        attributes.get("max_depth", attributes["report"].get("parameters", {}).get("max_depth", -1)),
         measurement,
         reflection,
         operators,
@@ -134,6 +135,7 @@ def _upgraded(attributes: dict[str, Any], old: Arrays) -> tuple[dict[str, Any], 
         "reflection": {
             "kind": "in_out_factors" if glossy else "diffuse",
             "factors": attributes.get("factors"),
+            "harmonics": attributes["report"].get("parameters", {}).get("harmonics"),
         },
         "operators": kinds,
         "scene_hash": attributes["scene_hash"],

@@ -67,6 +67,8 @@ class LightTransport:
     emission : EmissionSpace
         E: the columns.
     basis : {"direction", "texel"}
+    max_depth : int
+        As Mitsuba's ``path``: 2 is direct light only, -1 no limit.
     measurement : Measurement
         M: the points of the rows.
     reflection : Reflection
@@ -81,6 +83,7 @@ class LightTransport:
 
     emission: EmissionSpace
     basis: str
+    max_depth: int
     measurement: Measurement
     reflection: Reflection
     operators: Mapping[str, Operator]
@@ -336,15 +339,15 @@ class LightTransport:
             If the transport was not made with ``harmonics``, whose terms serve any BSDF, if there is no such glossy
             mesh, or if the BSDF cannot be factored or its diffuse part varies over the surface.
         """
-        order, reflection = self.report.get("parameters", {}).get("harmonics"), self.reflection
-        if order is None or not isinstance(reflection, InOutFactors):
+        reflection = self.reflection
+        if not isinstance(reflection, InOutFactors) or reflection.harmonics is None:
             raise PrtError(
                 "these terms are of their own BRDFs; precompute them with harmonics=3 to choose later"
             )
         known = {m.name: m.vertices for m in self.meshes if reflection.material[m.vertices.start] >= 0}
         if mesh not in known:
             raise PrtError(f"{mesh!r} is no glossy mesh of this transport; it has: {', '.join(known)}")
-        factors = harmonic_factors(bsdf, mesh, order)
+        factors = harmonic_factors(bsdf, mesh, reflection.harmonics)
         if factors.varying_diffuse:
             raise PrtError(f"shape '{mesh}': the new BSDF has a texture; give one that is the same all over")
         material, albedo = reflection.material.copy(), reflection.albedo.copy()
@@ -369,6 +372,7 @@ class LightTransport:
             "version": VERSION,
             "emission": {"kind": self.emission.kind, **self.emission.attributes()},
             "basis": self.basis,
+            "max_depth": self.max_depth,
             "measurement": self.measurement.attributes(),
             "reflection": {"kind": self.reflection.kind, **self.reflection.attributes()},
             "scene_hash": self.scene_hash,

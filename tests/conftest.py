@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.estimation.element_sampling import Effort
 from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
@@ -162,7 +161,7 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
         coarse = lighting if "full" in form else prt.CubemapLighting(n // 2)
         channels = 1 if "full" in form else 3
         density = rng.random((n_vertices, coarse.n_directions, channels)).astype(np.float16)
-        indirect = Upsampled(density, upsampling(coarse, lighting), lighting)
+        indirect = Upsampled(density, lighting.upsampling(coarse), lighting)
     if "factored" in form:
         ranks = (3,) if "grey" in form else (2, 3, 5)
         sides = [[rng.random(shape, np.float32) for shape in ((n_vertices, r), (r, m))] for r in ranks]
@@ -176,6 +175,7 @@ def made_up(form: str, n: int = 4, n_vertices: int = 50) -> LightTransport:
     return LightTransport(
         emission=lighting,
         basis="direction" if form.startswith("bits") else "texel",
+        max_depth=5,
         measurement=Measurement(
             keys, areas, (MeshRange("a", slice(0, 20)), MeshRange("b", slice(20, n_vertices)))
         ),

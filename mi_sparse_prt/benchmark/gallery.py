@@ -15,11 +15,11 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.precompute import precompute, precompute_glossy
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
-from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 from mi_sparse_prt.validation.matrix_figures import draw_picture, panels, picture_row, tonemapped
-from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices, reference_image
+from mi_sparse_prt.validation.mitsuba_reference import image_of_vertices, path_image
 from mi_sparse_prt.validation.validate import save_figures
 
 SPP, REFERENCE_SPP = 64, 256
@@ -69,9 +69,8 @@ def _draw(scene: Scene, transport: LightTransport, progress: bool) -> dict[str, 
     light = transport.lighting.project(scene.mitsuba.environment())
     compressed = compress(transport, progress=progress)
     ours, small = (render(scene, t, light, spp=SPP, progress=progress) for t in (transport, compressed))
-    background = background_emitter(light, transport.lighting)
-    sensor = scene.mitsuba.sensors()[0]
-    truth = reference_image(scene, background, sensor, MAX_DEPTH, REFERENCE_SPP, seed=0)
+    with transport.emission.scene_lit_by(light, scene) as lit:
+        truth = path_image(lit, scene.sensor(0), MAX_DEPTH, REFERENCE_SPP, seed=0)
     images = {
         "Mitsuba path": truth,
         f"relit, {f'{transport.terms} terms' if transport.terms else 'matrix'}": ours,

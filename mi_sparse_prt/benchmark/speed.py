@@ -14,7 +14,6 @@ from mi_sparse_prt.benchmark.kernels import launched_kernels
 from mi_sparse_prt.benchmark.measuring import report_header, timed
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -141,7 +140,7 @@ def measure_relighting(
         row[:] = rng.random(row.shape, dtype=np.float32)
     radiance = rng.random((lighting.n_directions, 3), dtype=np.float32)
     problem, seen = diffuse_problem(scene, lighting), Visibility(bits, scene.normals, lighting)
-    interreflected = Upsampled(density, upsampling(coarse, lighting), lighting)
+    interreflected = Upsampled(density, lighting.upsampling(coarse), lighting)
     direct, both = (
         matrix_of(problem, MethodResult(seen, more, 0, {}, {})) for more in (None, interreflected)
     )

@@ -1,41 +1,35 @@
-"""Light from infinity on a cubemap of 6 x n x n texels: geometry, solid angles, projections onto it.
-
-The one definition of the layout. Faces in the order +X, -X, +Y, -Y, +Z, -Z, world frame, oriented as OpenGL's cube
-maps. Texel (row, col) of face f has index j = f n^2 + row n + col and covers the square of face coordinates
-[2 col / n - 1, 2 (col + 1) / n - 1] (s) x [2 row / n - 1, 2 (row + 1) / n - 1] (t); the point (s, t) of a face lies in
-the direction `centre + s * s_axis + t * t_axis` with the axes of `FACE_FRAMES`.
-
-NumPy arrays are used where things are computed once; the functions on Dr.Jit arrays (`face_coordinates`,
-`face_direction`, `texel_at`) are also what the `cubemap` emitter traces.
-"""
+"""E as light from infinity, constant over each texel of a cubemap (laid out by ``cube_faces``)."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cube_faces import (
+    FACE_FRAMES,
+    face_coordinates,
+    subtexels,
+    texel_at,
+    texels_beside,
+    texels_towards,
+)
 from mi_sparse_prt.emission.environment import Environment, load_environment
 from mi_sparse_prt.emission.equirectangular import Potential
-
-# [face, (s_axis, t_axis, centre), xyz]
-FACE_FRAMES = np.array(
-    [
-        [[0, 0, -1], [0, -1, 0], [1, 0, 0]],  # +X
-        [[0, 0, 1], [0, -1, 0], [-1, 0, 0]],  # -X
-        [[1, 0, 0], [0, 0, 1], [0, 1, 0]],  # +Y
-        [[1, 0, 0], [0, 0, -1], [0, -1, 0]],  # -Y
-        [[1, 0, 0], [0, -1, 0], [0, 0, 1]],  # +Z
-        [[-1, 0, 0], [0, -1, 0], [0, 0, -1]],  # -Z
-    ],
-    dtype=np.float64,
-)
+from mi_sparse_prt.emission.texel_adjacency import TexelSides
+from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
+from mi_sparse_prt.scene.scene import Scene
 
 
 class CubemapLighting:
@@ -113,8 +107,31 @@ class CubemapLighting:
         directions = np.asarray(directions, dtype=np.float32)
         if directions.ndim != 2 or directions.shape[1] != 3:
             raise PrtError(f"directions have shape {directions.shape}; give (m, 3)")
-        d = mi.Vector3f(np.ascontiguousarray(directions.T))
-        return texel_at(*face_coordinates(d), self.resolution).numpy().astype(np.int32)
+        return texels_towards(directions, self.resolution)
+
+    def coarser(self, factor: int) -> CubemapLighting:
+        """The cubemap whose texels have so many times the side; PrtError if there is none."""
+        return CubemapLighting(self.resolution // factor)
+
+    def upsampling(self, coarse: CubemapLighting) -> scipy.sparse.csr_array:
+        """(6 n^2, 6 n_coarse^2): interpolates values at the centres of a coarser cubemap's texels, bilinearly."""
+        return upsampling(coarse.resolution, self.resolution)
+
+    def beside(self, dx: int, dy: int) -> NDArray[np.int32]:
+        """(6 n^2,) texels some columns and rows from each; -1 beyond a corner of the cube."""
+        return texels_beside(self.resolution, dx, dy)
+
+    @cached_property
+    def sides(self) -> TexelSides:
+        """Which texels meet, for edges of visibility between them."""
+        return TexelSides(self.resolution)
+
+    @contextmanager
+    def scene_lit_by(self, light: Any, scene: Scene) -> Iterator[mi.Scene]:
+        """A Mitsuba scene of the same surfaces under a light, constant over each texel, and no other; world space."""
+        n, texels = self.resolution, self.project(light)
+        sky = {"type": "cubemap", "resolution": n, "data": mi.TensorXf(texels.reshape(6, n, n, 3))}
+        yield lit_scene(scene.unlit_shapes(), sky)
 
     def subdirections(self, s: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split every texel into s x s squares of face coordinates.
@@ -126,7 +143,7 @@ class CubemapLighting:
         solid_angles : (6 n^2, s^2) float32
             Their exact solid angles in steradians; over s^2 they sum to `self.solid_angles`.
         """
-        directions, solid_angles = _subtexels(np.arange(self.n_directions), self.resolution, s)
+        directions, solid_angles = subtexels(np.arange(self.n_directions), self.resolution, s)
         return directions.astype(np.float32), solid_angles.astype(np.float32)
 
     def project(self, environment: object) -> NDArray[np.float32]:
@@ -188,63 +205,6 @@ class CubemapLighting:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Geometry, Dr.Jit
-
-
-def face_coordinates(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-    """Face of each direction (any length) and its coordinates s, t in [-1, 1].
-
-    On edges shared by faces the first face of the order wins.
-    """
-    largest = dr.max(dr.abs(d))
-    face, s, t = mi.UInt32(0), mi.Float(0), mi.Float(0)
-    for f in reversed(range(6)):
-        s_axis, t_axis, centre = (mi.ScalarVector3f(axis) for axis in FACE_FRAMES[f])
-        here = dr.dot(centre, d) == largest
-        face = dr.select(here, f, face)
-        s = dr.select(here, dr.dot(s_axis, d), s)
-        t = dr.select(here, dr.dot(t_axis, d), t)
-    return face, s / largest, t / largest
-
-
-def face_direction(face: mi.UInt32, s: mi.Float, t: mi.Float) -> mi.Vector3f:
-    """Unit direction of the point (s, t) of a face; the inverse of `face_coordinates`."""
-    d = mi.Vector3f(0)
-    for f in range(6):
-        s_axis, t_axis, centre = (mi.ScalarVector3f(axis) for axis in FACE_FRAMES[f])
-        d = dr.select(face == f, centre + s * s_axis + t * t_axis, d)
-    return dr.normalize(d)
-
-
-def texel_at(face: mi.UInt32, s: mi.Float, t: mi.Float, n: int) -> mi.UInt32:
-    """Index j of the texel that the point (s, t) of a face of n x n texels lies in."""
-    row, col = (dr.clip(mi.Int32(dr.floor((x + 1) * (n / 2))), 0, n - 1) for x in (t, s))
-    return (face * n + mi.UInt32(row)) * n + mi.UInt32(col)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Geometry, NumPy
-
-
-def _subtexels(texels: NDArray[np.int_], n: int, s: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions (m, s^2, 3) and solid angles (m, s^2) of the s x s squares of m texels."""
-    face, row, col = np.unravel_index(texels, (6, n, n))  # [m] each
-    edges = 2 * np.arange(s + 1) / (n * s)
-    s_edge, t_edge = 2 * col[:, None] / n - 1 + edges, 2 * row[:, None] / n - 1 + edges  # [m, s + 1]
-
-    # Solid angle of [0, x] x [0, y] on a face; a rectangle's is the second difference over its corners
-    x, y = s_edge[:, None, :], t_edge[:, :, None]
-    corner = np.arctan2(x * y, np.sqrt(x * x + y * y + 1))  # [m, s + 1 (t), s + 1 (s)]
-    solid_angles = np.diff(np.diff(corner, axis=1), axis=2)
-
-    x, y = ((e[:, 1:] + e[:, :-1]) / 2 for e in (s_edge, t_edge))  # [m, s]
-    s_axis, t_axis, centre = (FACE_FRAMES[face, i][:, None, None] for i in range(3))  # [m, 1, 1, xyz]
-    d = centre + x[:, None, :, None] * s_axis + y[:, :, None, None] * t_axis  # [m, s (t), s (s), xyz]
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    return d.reshape(len(texels), s * s, 3), solid_angles.reshape(len(texels), s * s)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # Projections
 
 
@@ -260,7 +220,7 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
     radiance = np.empty((lighting.n_directions, 3))  # [texel, rgb]
     for start in range(0, lighting.n_directions, block):
         texels = np.arange(start, min(start + block, lighting.n_directions))
-        directions, weights = _subtexels(texels, n, s)
+        directions, weights = subtexels(texels, n, s)
         si = dr.zeros(mi.SurfaceInteraction3f, weights.size)
         si.wi = mi.Vector3f(np.ascontiguousarray(-directions.reshape(-1, 3).T, dtype=np.float32))
         values = np.array(emitter.eval(si), dtype=np.float64)  # [rgb, texel * sub], one column if constant
@@ -284,7 +244,7 @@ def _samples_per_edge(emitter: mi.Emitter, n: int) -> int:
 def _project_image(environment: Environment, lighting: CubemapLighting) -> NDArray[np.float32]:
     """Area-weighted mean of the image's pixels over each texel: exact, face by face from the texels' borders."""
     n = lighting.resolution
-    _, solid_angles = _subtexels(np.arange(lighting.n_directions), n, 1)
+    _, solid_angles = subtexels(np.arange(lighting.n_directions), n, 1)
     potential = Potential(environment.pixels)
     excess = np.empty((6, n, n, 3))  # [face, row, col, rgb], integral of (image - mean)
     edges = 2 * np.arange(n + 1) / n - 1

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.scene import Scene
+
+# parameters of Mitsuba's emitters that their light is proportional to, and of the textures these may be
+_RADIATED = ("radiance", "intensity", "irradiance", "data")
+_LEAVES = ("value", "data")
 
 
 class SceneEmitters:
@@ -58,7 +64,7 @@ class SceneEmitters:
                 raise PrtError(f"group {group!r} names no emitter; the scene has: {', '.join(known)}")
         self.groups = {name: list(members) for name, members in chosen.items()}
         self.names = tuple(chosen)
-        numbers = [[known[name] for name in members] for members in chosen.values()]
+        numbers = self._members = [[known[name] for name in members] for members in chosen.values()]
         lengths = [len(members) for members in numbers]
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.uint32))
         self._count = mi.UInt32(np.array(lengths, np.uint32))
@@ -85,6 +91,40 @@ class SceneEmitters:
 
     def neighbours(self, count: int) -> None:
         """Lamps have none."""
+
+    def coarser(self, factor: int) -> None:
+        """There is nothing between two lamps."""
+
+    def upsampling(self, coarse: Any) -> scipy.sparse.csr_array:
+        """The identity: there is no coarser version."""
+        return scipy.sparse.eye_array(self.size, format="csr", dtype=np.float32)
+
+    @property
+    def sides(self) -> None:
+        """Lamps have none."""
+
+    @contextmanager
+    def scene_lit_by(self, light: Any, scene: Scene) -> Iterator[mi.Scene]:
+        """The scene itself with its lamps dimmed and coloured, see ``EmissionSpace``.
+
+        Raises
+        ------
+        PrtError
+            If an emitter takes no colour and should (``sunsky``).
+        """
+        brightness = np.zeros((len(scene.mitsuba.emitters()), 3), np.float32)
+        for group, values in zip(self._members, self.project(light), strict=True):
+            brightness[group] += values
+        kept = []
+        try:
+            for emitter, values in zip(scene.mitsuba.emitters(), brightness, strict=True):
+                kept.append(_dimmed(emitter, values))
+            scene.mitsuba.parameters_changed([])  # what is dark is not sampled
+            yield scene.mitsuba
+        finally:
+            for parameters, before in kept:
+                parameters.update(before)
+            scene.mitsuba.parameters_changed([])
 
     def __repr__(self) -> str:
         return f"SceneEmitters({', '.join(self.names)})"
@@ -171,13 +211,49 @@ class StoredEmitters:
         """The lamps of a scene that have these names."""
         return SceneEmitters(scene, self.groups)
 
+    def scene_lit_by(self, light: Any, scene: Scene) -> AbstractContextManager[mi.Scene]:
+        """As that of ``SceneEmitters``."""
+        return self.of_scene(scene).scene_lit_by(light, scene)
+
     size = SceneEmitters.size
     weights = SceneEmitters.weights
     coordinates = SceneEmitters.coordinates
     neighbours = SceneEmitters.neighbours
+    coarser = SceneEmitters.coarser
+    upsampling = SceneEmitters.upsampling
+    sides = SceneEmitters.sides
     project = SceneEmitters.project
     attributes = SceneEmitters.attributes
     __repr__ = SceneEmitters.__repr__
+
+
+def _dimmed(
+    emitter: mi.Emitter, brightness: NDArray[np.float32]
+) -> tuple[mi.SceneParameters, dict[str, Any]]:
+    """Multiply what an emitter sends out by an RGB triple; its parameters, and what they were."""
+    parameters = mi.traverse(emitter)
+    light = [
+        key for key in parameters.keys() if key.split(".")[0] in _RADIATED and key.split(".")[-1] in _LEAVES
+    ]
+    if not light:
+        light = [key for key in parameters.keys() if key.endswith("_scale")]
+        if not light or np.ptp(brightness):
+            raise PrtError(
+                f"the emitter {emitter.id()!r} ({emitter.class_name()}) takes no colour; dim it evenly"
+            )
+    before = {key: type(parameters[key])(parameters[key]) for key in [*light, "sampling_weight"]}
+    for key in light:
+        value = before[key]
+        if isinstance(value, mi.Color3f):
+            parameters[key] = value * mi.Color3f(*map(float, brightness))
+        elif isinstance(value, float):
+            parameters[key] = value * float(brightness[0])
+        else:  # an image, (height, width, 3)
+            parameters[key] = type(value)(np.array(value) * brightness)
+    if not brightness.any():
+        parameters["sampling_weight"] = 0.0
+    parameters.update()
+    return parameters, before
 
 
 def _emitter_names(scene: Scene) -> dict[str, int]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
 
+import mitsuba as mi
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
+
+from mi_sparse_prt.scene.scene import Scene
 
 
 class EmissionSpace(Protocol):
@@ -42,6 +47,22 @@ class EmissionSpace(Protocol):
         ------
         PrtError
             If it is no light of this space, or not finite.
+        """
+
+    def coarser(self, factor: int, /) -> EmissionSpace | None:
+        """The same light in elements so many times as wide; None where elements have no neighbours."""
+
+    def upsampling(self, coarse: Any, /) -> scipy.sparse.csr_array:
+        """(size, coarse.size): interpolates what is known of the elements of a coarser version."""
+
+    @property
+    def sides(self) -> Any:
+        """Which elements meet along sides and at corners, ``TexelSides``; None where they have no neighbours."""
+
+    def scene_lit_by(self, light: Any, scene: Scene, /) -> AbstractContextManager[mi.Scene]:
+        """A Mitsuba scene of the same surfaces under a light of this space and no other, world space.
+
+        It is valid within the context. ``light`` is what ``project`` takes.
         """
 
     def attributes(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bit_of, pack
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
+from mi_sparse_prt.emission.cube_faces import cube_points, face_places, texels_beside
 
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -54,7 +54,8 @@ class TexelSides:
 
     Parameters
     ----------
-    lighting : CubemapLighting
+    resolution : int
+        n, texels along a face's edge.
 
     Attributes
     ----------
@@ -63,15 +64,16 @@ class TexelSides:
         On the cube [-1, 1]^3: centre of the first texel, middle of the common side, centre of the second.
     """
 
-    def __init__(self, lighting: CubemapLighting) -> None:
-        m, self._resolution = lighting.n_directions, lighting.resolution
+    def __init__(self, resolution: int) -> None:
+        m, self._resolution = 6 * resolution**2, resolution
         beside, across = (
-            np.stack([_beyond(lighting, *step) for step in steps], axis=1) for steps in (_SIDES, _CORNERS)
+            np.stack([texels_beside(resolution, *step) for step in steps], axis=1)
+            for steps in (_SIDES, _CORNERS)
         )
         texel, side = np.divmod(np.arange(4 * m), 4)  # every side of every texel
         other = beside[texel, side]
         back = np.argmax(beside[other] == texel[:, None], axis=1)  # the other's side towards this one
-        number = _numbers(texel, side, other, lighting.resolution)
+        number = _numbers(texel, side, other, resolution)
         named = np.flatnonzero(number >= 0)  # each pair by one of its two texels
         pair, texel, side, other, back = number[named], texel[named], side[named], other[named], back[named]
         ways = np.empty((m, 4), np.int32)
@@ -86,8 +88,8 @@ class TexelSides:
         self.tables = Sides(beside, across, first, second, around, _quadrants(beside, across, ways))
 
         self.paths = np.zeros((n_pairs, 3, 3), np.float32)
-        centres = _points(lighting, 0, 0)
-        middles = np.stack([_points(lighting, *step) for step in _SIDES], axis=1)
+        centres = _points(resolution, 0, 0)
+        middles = np.stack([_points(resolution, *step) for step in _SIDES], axis=1)
         self.paths[pair] = np.stack([centres[texel], middles[texel, side], centres[other]], axis=1)
 
         padded = -(-m // BITS) * BITS
@@ -112,28 +114,10 @@ class TexelSides:
         return result
 
 
-def _grid(lighting: CubemapLighting) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Face and face coordinates (s, t) of each texel's centre."""
-    n = lighting.resolution
-    face, row, column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
-    return face, (2 * column + 1) / n - 1, (2 * row + 1) / n - 1
-
-
-def _points(lighting: CubemapLighting, dx: float, dy: float) -> NDArray[np.float64]:
-    """Points (n_directions, 3) so many half texels from each centre, on the plane of its face."""
-    face, s, t = _grid(lighting)
-    s_axis, t_axis, centre = (FACE_FRAMES[face, axis] for axis in range(3))
-    n = lighting.resolution
-    return centre + (s + dx / n)[:, None] * s_axis + (t + dy / n)[:, None] * t_axis
-
-
-def _beyond(lighting: CubemapLighting, dx: int, dy: int) -> Ints:
-    """The texel beyond a side or a corner of each, -1 beyond a corner of the cube."""
-    _, s, t = _grid(lighting)
-    step = 1.01  # half texels: just beyond a side
-    texels = lighting.texel_of(_points(lighting, step * dx, step * dy))
-    outside = [np.abs(x + step * d / lighting.resolution) > 1 for x, d in ((s, dx), (t, dy))]
-    return np.where(outside[0] & outside[1], -1, texels).astype(np.int32)
+def _points(n: int, dx: float, dy: float) -> NDArray[np.float64]:
+    """Points (6 n^2, 3) so many half texels from each centre, on the plane of its face."""
+    face, s, t = face_places(n)
+    return cube_points(face, s + dx / n, t + dy / n)
 
 
 def _numbers(

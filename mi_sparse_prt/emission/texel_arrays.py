@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
+from mi_sparse_prt.emission.cube_faces import FACE_FRAMES
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 
 class TexelArrays:

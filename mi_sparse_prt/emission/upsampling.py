@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
+from mi_sparse_prt.emission.cube_faces import cube_points, texels_towards
 
 
-def upsampling(coarse: CubemapLighting, fine: CubemapLighting) -> scipy.sparse.csr_array:
+def upsampling(coarse: int, fine: int) -> scipy.sparse.csr_array:
     """Bilinear interpolation of values at coarse texel centres to fine texel centres.
 
     Parameters
     ----------
-    coarse, fine : CubemapLighting
-        The coarse resolution divides the fine one; where they are equal the result is the identity.
+    coarse, fine : int
+        Resolutions; the coarse one divides the fine one. Where they are equal the result is the identity.
 
     Returns
     -------
@@ -22,10 +22,10 @@ def upsampling(coarse: CubemapLighting, fine: CubemapLighting) -> scipy.sparse.c
         Rows sum to 1. Where a neighbour lies beyond a face's edge, it is the texel that the continued face plane
         points at on the next face.
     """
-    if coarse.resolution == fine.resolution:
-        return scipy.sparse.eye_array(fine.n_directions, format="csr", dtype=np.float32)
-    n, m = fine.resolution, coarse.resolution
-    face, row, col = np.unravel_index(np.arange(fine.n_directions), (6, n, n))
+    n, m = fine, coarse
+    if n == m:
+        return scipy.sparse.eye_array(6 * n * n, format="csr", dtype=np.float32)
+    face, row, col = np.unravel_index(np.arange(6 * n * n), (6, n, n))
     y, x = (
         (i + 0.5) * m / n - 0.5 for i in (row, col)
     )  # in units of coarse texels, centres at whole numbers
@@ -34,9 +34,8 @@ def upsampling(coarse: CubemapLighting, fine: CubemapLighting) -> scipy.sparse.c
         for dx in (0, 1):
             r, c = np.floor(y) + dy, np.floor(x) + dx
             s, t = (2 * c + 1) / m - 1, (2 * r + 1) / m - 1  # may leave [-1, 1] by half a texel
-            s_axis, t_axis, centre = (FACE_FRAMES[face, axis] for axis in range(3))
-            indices.append(coarse.texel_of(centre + s[:, None] * s_axis + t[:, None] * t_axis))
+            indices.append(texels_towards(cube_points(face, s, t), m))
             data.append((1 - np.abs(y - r)) * (1 - np.abs(x - c)))
-    rows = np.tile(np.arange(fine.n_directions), 4)
+    rows = np.tile(np.arange(6 * n * n), 4)
     entries = (np.concatenate(data).astype(np.float32), (rows, np.concatenate(indices)))
-    return scipy.sparse.coo_array(entries, shape=(fine.n_directions, coarse.n_directions)).tocsr()
+    return scipy.sparse.coo_array(entries, shape=(6 * n * n, 6 * m * m)).tocsr()

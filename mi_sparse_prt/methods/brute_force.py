@@ -11,7 +11,6 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.methods.result import MethodResult
@@ -54,7 +53,7 @@ def path_traced(solver: PathSolver, lighting: CubemapLighting, run: Run) -> Upsa
         kept = Checkpoint(checkpoint, density) if checkpoint else None
         bar = run.bar(len(density), "indirect", done=kept.rows_done if kept else 0)
         _trace(solver, density, lambda ids: solver.rows(ids).mean, bar, kept)
-    return Upsampled(density, upsampling(solver.lighting, lighting), lighting)
+    return Upsampled(density, lighting.upsampling(solver.lighting), lighting)
 
 
 def share_above_horizon(points: Points, lighting: CubemapLighting) -> float:

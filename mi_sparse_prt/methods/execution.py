@@ -185,6 +185,7 @@ def matrix_of(problem: Problem, parts: MethodResult) -> LightTransport:
     return LightTransport(
         problem.emission,
         problem.basis,
+        problem.max_depth,
         problem.measurement,
         problem.reflection,
         operators,
@@ -203,4 +204,4 @@ def _rows_of_terms(part: Upsampled, colours: int, glossy: NDArray[np.int64]) -> 
 def indirect_solver(problem: Problem, settings: Settings) -> PathSolver:
     """The path tracer that settings ask for, at the problem's points."""
     kind = TermPaths if isinstance(problem.reflection, InOutFactors) else PathSolver
-    return kind(problem.on(settings.coarse), settings.samples, settings.seed)
+    return kind(problem.on(settings.element_resolution), settings.samples, settings.seed)

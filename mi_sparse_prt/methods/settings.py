@@ -63,7 +63,7 @@ class Settings:
                 f"method {self._name!r} and terms of glossy surfaces are for the vertices of meshes; at pixels leave "
                 'both out, or set method="gather" or "brute_force"'
             )
-        if self.coarse.resolution > self.resolution:
+        if CubemapLighting(self.element_resolution).resolution > self.resolution:
             raise PrtError(
                 f"indirect_resolution {self.indirect_resolution} is finer than the lighting's; "
                 f"use at most {self.resolution}"
@@ -132,8 +132,6 @@ class Settings:
         return SPP if self.spp is None else self.spp
 
     @property
-    def coarse(self) -> CubemapLighting:
-        """The cubemap on which indirect light is computed."""
-        return CubemapLighting(
-            self.resolution if self.indirect_resolution is None else self.indirect_resolution
-        )
+    def element_resolution(self) -> int:
+        """Of the cubemap on which indirect light is computed."""
+        return self.resolution if self.indirect_resolution is None else self.indirect_resolution

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.execution import indirect_solver
 from mi_sparse_prt.methods.settings import Settings
@@ -110,7 +109,7 @@ def _interpolated(
     solver: PathSolver, lighting: CubemapLighting, held: PilotElements
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and variance (k, t, channels) at the held-out elements, interpolated from coarse rows."""
-    estimate, weights = solver.rows(held.vertices), upsampling(solver.lighting, lighting)
+    estimate, weights = solver.rows(held.vertices), lighting.upsampling(solver.lighting)
     shape = (*held.texels.shape, solver.channels)
     mean, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for k, texels in enumerate(held.texels):

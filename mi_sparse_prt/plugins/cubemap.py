@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.emission.cubemap import CubemapLighting, face_coordinates, face_direction, texel_at
+from mi_sparse_prt.emission.cube_faces import face_coordinates, face_direction, texel_at
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import load_environment
 
 

@@ -30,6 +30,8 @@ class InOutFactors(Reflection):
     material : (n,) int64
         Number of a point's BRDF among ``factors``, -1 if it is diffuse.
     factors : tuple of BrdfFactors
+    harmonics : int, optional
+        Their incident factors are spherical harmonics up to this order, which serve any BRDF.
     """
 
     kind: ClassVar[str] = "in_out_factors"
@@ -38,6 +40,7 @@ class InOutFactors(Reflection):
     normals: Floats
     material: NDArray[np.int64]
     factors: tuple[BrdfFactors, ...]
+    harmonics: int | None = None
 
     @property
     def terms(self) -> int:
@@ -130,7 +133,8 @@ class InOutFactors(Reflection):
             "factors": [
                 {"heights": f.grid.heights, "azimuths": f.grid.azimuths, "varying_diffuse": f.varying_diffuse}
                 for f in self.factors
-            ]
+            ],
+            "harmonics": self.harmonics,
         }
 
     @classmethod
@@ -146,7 +150,7 @@ class InOutFactors(Reflection):
             raise ValueError("vertices and their BRDFs do not fit together")
         if not albedo.shape == tangents.shape == normals.shape == (n, 3) or material.shape != (n,):
             raise ValueError("vertices and their tangents do not fit together")
-        return cls(albedo, tangents, normals, material, factors)
+        return cls(albedo, tangents, normals, material, factors, attributes.get("harmonics"))
 
 
 def _read_factors(number: int, known: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> BrdfFactors:

@@ -74,4 +74,4 @@ def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None
         raise PrtError(
             "no surface of the scene is glossy: leave terms out, its matrix is the same for all views"
         )
-    return InOutFactors(albedo, vertex_tangents(scene), scene.normals, material, tuple(factors))
+    return InOutFactors(albedo, vertex_tangents(scene), scene.normals, material, tuple(factors), harmonics)

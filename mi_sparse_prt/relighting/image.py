@@ -229,13 +229,20 @@ def render(
     """
     sensor = scene.sensor(sensor)
     transport = transport.for_scene(scene)
-    at_pixels = transport.measurement.image
-    if at_pixels is not None and at_pixels != tuple(int(n) for n in sensor.film().crop_size())[::-1]:
-        raise PrtError(
-            f"this matrix has the pixels of another camera: {at_pixels[1]} x {at_pixels[0]}; give that one"
-        )
+    check_camera(transport, sensor)
     image = _rendered(scene, sensor, _relit_scene(scene, transport, environment), spp, seed, progress)
-    return image if at_pixels is None else image + transport.relight(environment).reshape(image.shape)
+    if transport.measurement.image is None:
+        return image
+    return image + transport.relight(environment).reshape(image.shape)
+
+
+def check_camera(transport: LightTransport, sensor: mi.Sensor) -> None:
+    """Refuse a camera whose image has another size than that of a matrix of pixels (PrtError)."""
+    pixels = transport.measurement.image
+    if pixels is not None and pixels != tuple(int(n) for n in sensor.film().crop_size())[::-1]:
+        raise PrtError(
+            f"this matrix has the pixels of another camera: {pixels[1]} x {pixels[0]}; give that one"
+        )
 
 
 def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> RelitScene:

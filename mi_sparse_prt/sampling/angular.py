@@ -16,7 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, list_bits, lowest_bit, pack, scatter_bits
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES, CubemapLighting
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class AngularGrid:
     def __init__(self, lighting: CubemapLighting, radius: int = 3) -> None:
         self.lighting, self._radius = lighting, radius
         n = lighting.resolution
-        self._face, self._row, self._column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
-        self._sampled = (self._row % 2 == 0) & (self._column % 2 == 0)
+        _, row, column = np.unravel_index(np.arange(lighting.n_directions), (6, n, n))
+        self._sampled = (row % 2 == 0) & (column % 2 == 0)
         self.texels, self.bits = np.flatnonzero(self._sampled), pack(self._sampled)
 
     def sample(
@@ -97,8 +97,8 @@ class AngularGrid:
         steps = range(-self._radius, self._radius + 1)
         for dy in steps:
             for dx in steps:
-                texels, inside = self._shift(dx, dy)
-                columns.append(np.where(self._sampled[texels] & inside, texels, -1))
+                texels = self.lighting.beside(dx, dy)
+                columns.append(np.where(self._sampled[texels], texels, -1))
         table = np.sort(np.stack(columns, axis=1), axis=1)[:, ::-1]  # [texel, place], -1 last
         table[:, 1:][table[:, 1:] == table[:, :-1]] = -1  # beyond an edge two places can meet one texel
         table = np.sort(table, axis=1)[:, ::-1]
@@ -133,10 +133,10 @@ class AngularGrid:
         rows, columns, weights = [], [], []
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                texels, inside = self._shift(dx, dy)
+                texels = self.lighting.beside(dx, dy)
                 # a sampled texel keeps its own value
                 wanted = ~self._sampled if dx or dy else np.ones_like(self._sampled)
-                good = np.flatnonzero(self._sampled[texels] & inside & wanted)
+                good = np.flatnonzero(self._sampled[texels] & (texels >= 0) & wanted)
                 rows.append(good)
                 columns.append(index[texels[good]])
                 weights.append(np.full(len(good), (1 - abs(dx) / 2) * (1 - abs(dy) / 2)))
@@ -144,20 +144,6 @@ class AngularGrid:
         matrix = scipy.sparse.coo_array(entries, shape=(self.lighting.n_directions, len(self.texels))).tocsr()
         total = matrix.sum(axis=1)
         return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / total) @ matrix, dtype=np.float32)
-
-    def _shift(self, dx: int, dy: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The texel (dx, dy) beside each texel, and whether it is not beyond two edges at once."""
-        n = self.lighting.resolution
-        column, row = self._column + dx, self._row + dy
-        texels = (self._face * n + row) * n + column
-        beside, above = (column < 0) | (column >= n), (row < 0) | (row >= n)
-        far = np.flatnonzero(beside | above)
-        if not len(far):
-            return texels, ~beside
-        s, t = (2 * column[far] + 1) / n - 1, (2 * row[far] + 1) / n - 1
-        s_axis, t_axis, centre = (FACE_FRAMES[self._face[far], axis] for axis in range(3))
-        texels[far] = self.lighting.texel_of(centre + s[:, None] * s_axis + t[:, None] * t_axis)
-        return texels, ~(beside & above)
 
 
 @numba.njit(parallel=True, cache=True)

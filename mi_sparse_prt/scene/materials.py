@@ -69,7 +69,10 @@ class Material:
                 "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
             )
         if self._emitter is not None:
-            notes.append(f"shape '{name}' is an area emitter: it does not take part in the transport matrix")
+            notes.append(
+                f"shape '{name}' is an area emitter: matrices of lamps (SceneEmitters) have its light, "
+                "those of a cubemap do not"
+            )
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             notes.append(
                 f"shape '{name}' bounds a medium: media are left out, light passes as through a vacuum"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -82,6 +83,12 @@ def watertight_scene() -> dict[str, Any]:
     """
     embree = {"embree_use_robust_intersections": True} if mi.variant().startswith("llvm") else {}
     return {"type": "scene", **embree}
+
+
+def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter | dict[str, Any], **others: Any) -> mi.Scene:
+    """Shapes under one ``light``, which rays do not slip between, and other objects by name."""
+    named = {f"shape_{k}": shape for k, shape in enumerate(shapes)}
+    return mi.load_dict({**watertight_scene(), "light": light, **others, **named})
 
 
 def build_mitsuba_scene(

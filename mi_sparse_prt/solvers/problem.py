@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
@@ -57,11 +56,10 @@ class Problem:
         where = Measurement(points.keys, np.ones(n, np.float32), (), "points", normalised=points)
         return replace(self, measurement=where, reflection=Diffuse(np.ones((n, 3), np.float32)))
 
-    def on(self, emission: CubemapLighting) -> Problem:
-        """The same on another cubemap; an element of a coarser one stands for all directions in its texel."""
-        if emission.resolution == self.emission.resolution:
-            return self
-        return replace(self, emission=emission, basis="texel")
+    def on(self, resolution: int) -> Problem:
+        """The same on a coarser cubemap, of which an element stands for all directions in its texel."""
+        factor = self.emission.resolution // resolution
+        return self if factor == 1 else replace(self, emission=self.emission.coarser(factor), basis="texel")
 
     @property
     def at_vertices(self) -> Problem:

@@ -66,7 +66,7 @@ def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalV
     int
         Rays that were traced.
     """
-    sides, normals = TexelSides(direct.lighting), direct.points.normals
+    sides, normals = direct.lighting.sides, direct.points.normals
     paths = [mi.Point3f(np.ascontiguousarray(place.T)) for place in sides.paths.swapaxes(0, 1)]
     blocks, rays = [], 0
     for a in range(0, len(bits), BLOCK):

@@ -21,16 +21,17 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import flip_map, relative_l2_without_noise, relative_noise
 from mi_sparse_prt.core.run import Run
-from mi_sparse_prt.emission.cubemap import face_coordinates, face_direction, texel_at
+from mi_sparse_prt.emission.cube_faces import face_coordinates, face_direction, texel_at
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.plugins.cubemap import CubemapEmitter
 from mi_sparse_prt.plugins.in_out_factors import factored_bsdf
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.transport import LightTransport
-from mi_sparse_prt.validation.mitsuba_reference import lit_scene, posed
+from mi_sparse_prt.validation.mitsuba_reference import posed
 from mi_sparse_prt.validation.validate import Validation
 
 if TYPE_CHECKING:
@@ -226,8 +227,7 @@ class _References:
             "directions": lit_scene(factored, DirectionLights(lights)),
             "diffuse": lit_scene([with_bsdf(shape, unit_albedo) for shape in shapes], sky),
         }
-        depth = transport.report["parameters"]["max_depth"]
-        self._depth = MOST_BOUNCES if depth < 0 else depth
+        self._depth = MOST_BOUNCES if transport.max_depth < 0 else transport.max_depth
 
     def rendered(self, sensor: mi.Sensor, spp: int, seeds: tuple[int, ...]) -> dict[str, Halves]:
         """``ours``, ``real``, ``factored`` and ``directions``."""

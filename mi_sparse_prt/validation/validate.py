@@ -19,23 +19,30 @@ from mi_sparse_prt.core.metrics import (
     relative_l2_without_noise,
 )
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
-from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.relighting.image import background_emitter, check_camera, render
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.lamps import LampRays
 from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport, MeshRange
 from mi_sparse_prt.validation.mitsuba_reference import (
-    ReferenceMatrix,
     image_of_vertices,
+    path_image,
     posed,
-    reference_image,
     reference_vertices,
 )
+from mi_sparse_prt.validation.reference_matrix import ReferenceMatrix
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PIXELS = 1 << 14  # rows, at most, of a matrix of pixels
+PIXEL_SPP = 32  # at least
+COLUMNS = 32  # of a matrix of pixels at a time: it has many points
+STRATA = 8  # per axis, for what the move to a hit changes
 GRAZED = 1e-4  # relative difference from which an element of the direct part counts as different
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class Validation:
         ``reference_noise``; ``with_noise``: the plain difference; ``row_95th_percentile``, ``row_worst``,
         ``column_worst``; ``estimated_error``: what the matrix said of itself; ``direct_at_hits`` and
         ``hit_against_vertex``: see ``validate``; ``image``: relative L2 (noise taken out), FLIP, and in
-        ``interpolation`` the relative L2 of an image whose vertices Mitsuba itself computed.
+        ``interpolation`` the relative L2 of an image whose vertices Mitsuba itself computed (cubemap, vertices).
     figures : dict of matplotlib Figure
         ``image``, ``errors``, ``rows``.
     """
@@ -84,6 +91,7 @@ def validate(
     image: bool = True,
     image_width: int = 320,
     image_spp: int = 256,
+    sensor: int | mi.Sensor = 0,
 ) -> Validation:
     """Compare a matrix with Mitsuba's full render of it.
 
@@ -92,29 +100,38 @@ def validate(
     scene : Scene
     transport : LightTransport
     n_rows, n_columns : int
-        Vertices (drawn per mesh) and texels (drawn per stretch of the cubemap) that are rendered; all, if there are
-        no more.
+        Vertices (drawn per mesh) and elements (drawn per stretch of the cubemap) that are rendered; all, if there are
+        no more. Of pixels whole images are rendered, of which at most 16,384 pixels count.
     spp : int
-        Samples per element of the reference, in two independent halves: their difference is its noise.
+        Samples per element of the reference, in two independent halves: their difference is its noise. Pixels share the
+        samples of ``n_rows`` vertices, but have at least 32 each.
     seed : int
         Of the choice and of the reference.
     progress : bool
     image : bool
-        Also relight under the scene's own environment and compare with ``path`` under the same cubemap (if the scene
-        has a sensor and an environment).
+        Also relight and compare with ``path``: under the scene's own environment, constant over each texel (if it has
+        one, and a sensor), or by all lamps.
     image_width, image_spp : int
-        Size of the image; samples per pixel of its reference.
+        Size of the image (of pixels, that of the matrix); samples per pixel of its reference.
+    sensor : int or mi.Sensor
+        The camera of the image, and of the rows that are pixels.
 
     Returns
     -------
     Validation
+
+    Raises
+    ------
+    PrtError
+        If the matrix belongs to another scene, or its pixels to another camera.
 
     Notes
     -----
     Mitsuba sees a vertex through a ray that ends beside it, and light that grazes an edge there may miss the vertex.
     So the matrix is compared with its direct part moved to these hits, and what the move changes is reported
     apart: ``hit_against_vertex``, in relative L2 of the matrix. ``direct_at_hits`` is our direct part there against
-    Mitsuba's (without noise, in the direction basis): the share of elements that differ by more than 1e-4.
+    Mitsuba's (without noise, in the direction basis): the share of elements that differ by more than 1e-4. Matrices of
+    pixels have neither, those of lamps no ``direct_at_hits``.
     """
     from mi_sparse_prt.validation import (
         matrix_figures as draw,  # matplotlib: half a second for whoever imports us
@@ -122,32 +139,57 @@ def validate(
 
     transport = transport.for_scene(scene)
     rng = np.random.default_rng([seed, 2])
-    vertices = _stratified_vertices(transport.meshes, n_rows, rng)
-    texels = _stratified(transport.lighting.n_directions, n_columns, rng)
-    rays = vertex_rays(scene.normalised)
-    max_depth = transport.report["parameters"]["max_depth"]
-
-    reference = ReferenceMatrix(scene, transport.lighting, transport.basis, max_depth, vertices, rays)
+    rows = _chosen_rows(scene, transport, n_rows, sensor, rng)
+    elements = _stratified(transport.shape[1], n_columns, rng)
+    if rows.camera is not None:
+        spp = max(PIXEL_SPP, spp * n_rows // len(rows.ids))
+    emission, distant = transport.emission, transport.emission.kind == "cubemap"
+    own_rays = rows.rays if distant else None  # lamps are in the world's frame
+    reference = ReferenceMatrix(
+        scene, emission, transport.basis, transport.max_depth, rows.ids, own_rays, rows.camera
+    )
     halves = [
-        reference.columns(texels, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)
+        reference.columns(elements, max(1, spp // 2), seed=2 * seed + k, progress=progress) for k in (0, 1)
     ]
-    ours = transport.rows(vertices)
-    moved, at_hits = _moved_to_hits(scene, transport, ours[:, texels], rays, vertices, texels)
-    report = matrix_errors(moved, halves[0], halves[1], vertices, texels, transport.meshes)
+    moved, at_hits = _moved_to_hits(scene, transport, rows, elements, seed)
+    names = ("vertex" if rows.camera is None else "pixel"), ("texel" if distant else "lamp")
+    report = matrix_errors(moved, halves[0], halves[1], rows.ids, elements, rows.groups, names)
     report |= at_hits
     report["estimated_error"] = transport.report.get("estimated_error")
-    report["missed_vertices"] = int(rays.missed.sum())
-    report["parameters"] = {"rows": len(vertices), "columns": len(texels), "spp": spp, "seed": seed}
-    figures = {
-        "errors": draw.errors(moved, (halves[0] + halves[1]) / 2, vertices, transport.meshes),
-        "rows": draw.rows(ours, transport.lighting, vertices),
-    }
-    environment = scene.mitsuba.environment()
-    if image and environment is not None and scene.mitsuba.sensors():
-        report["image"], figures["image"] = _image_error(
-            scene, transport, environment, rays, image_width, image_spp, seed
-        )
+    report["missed_vertices"] = 0 if rows.rays is None else int(rows.rays.missed.sum())
+    report["parameters"] = {"rows": len(rows.ids), "columns": len(elements), "spp": spp, "seed": seed}
+    figures = {"errors": draw.errors(moved, (halves[0] + halves[1]) / 2, rows.ids, rows.groups)}
+    if distant:
+        shown = rows.ids[np.linspace(0, len(rows.ids) - 1, 4).astype(int)]
+        figures["rows"] = draw.rows(transport.rows(shown), transport.lighting, shown)
+    light = scene.mitsuba.environment() if distant else 1.0
+    if image and light is not None and (rows.camera or scene.mitsuba.sensors()):
+        camera = rows.camera or scene.sensor(sensor)
+        found = _image_error(scene, transport, light, camera, rows.rays, image_width, image_spp, seed)
+        report["image"], figures["image"] = found
     return Validation(report, figures)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The rows that are compared: vertices, and rays that end at all of these, or pixels of a camera."""
+
+    ids: NDArray[np.int64]
+    groups: tuple[MeshRange, ...]
+    rays: VertexRays | None = None
+    camera: mi.Sensor | None = None
+
+
+def _chosen_rows(
+    scene: Scene, transport: LightTransport, n_rows: int, sensor: int | mi.Sensor, rng: np.random.Generator
+) -> _Rows:
+    if transport.measurement.kind == "vertices":
+        ids = _stratified_vertices(transport.meshes, n_rows, rng)
+        return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised))
+    camera, pixels = scene.sensor(sensor), transport.shape[0]
+    check_camera(transport, camera)
+    groups = (MeshRange("image", slice(0, pixels)),)
+    return _Rows(_stratified(pixels, PIXELS, rng), groups, camera=camera)
 
 
 def matrix_errors(
@@ -157,6 +199,7 @@ def matrix_errors(
     vertices: NDArray[np.integer],
     texels: NDArray[np.integer],
     meshes: tuple[MeshRange, ...],
+    names: tuple[str, str] = ("vertex", "texel"),
 ) -> dict[str, Any]:
     """Errors of a part of a matrix against two independent, equally noisy references.
 
@@ -167,6 +210,8 @@ def matrix_errors(
         Where the part lies in the matrix.
     meshes : tuple of MeshRange
         A mesh counts by its number of vertices, however many of them were chosen.
+    names : (str, str)
+        What a row and a column are called.
 
     Returns
     -------
@@ -203,8 +248,8 @@ def matrix_errors(
         "reference_noise": total(noise),
         "with_noise": total(plain),
         "row_95th_percentile": float(np.percentile(rows, 95)),
-        "row_worst": {"vertex": int(vertices[worst_row]), "relative_l2": float(rows[worst_row])},
-        "column_worst": {"texel": int(texels[worst_column]), "relative_l2": float(columns[worst_column])},
+        "row_worst": {names[0]: int(vertices[worst_row]), "relative_l2": float(rows[worst_row])},
+        "column_worst": {names[1]: int(texels[worst_column]), "relative_l2": float(columns[worst_column])},
     }
 
 
@@ -229,71 +274,89 @@ def _stratified_vertices(
 
 
 def _moved_to_hits(
-    scene: Scene,
-    transport: LightTransport,
-    ours: NDArray[np.float32],
-    rays: VertexRays,
-    vertices: NDArray[np.int64],
-    texels: NDArray[np.int64],
-) -> tuple[NDArray[np.float32], dict[str, float]]:
+    scene: Scene, transport: LightTransport, rows: _Rows, elements: NDArray[np.int64], seed: int
+) -> tuple[Floats, dict[str, float]]:
     """Elements with their direct part evaluated where Mitsuba sees the vertices, and how right that part is there."""
-    lighting, parameters = transport.lighting, transport.report["parameters"]
-    flat = np.repeat(vertices, len(texels)), np.tile(texels, len(vertices))
-    hits = sensor_points(scene, rays)
+    if rows.rays is None:
+        blocks = [elements[a : a + COLUMNS] for a in range(0, len(elements), COLUMNS)]
+        return np.concatenate([transport.columns(block)[rows.ids] for block in blocks], axis=1), {}
+    ours, hits = transport.rows(rows.ids)[:, elements], sensor_points(scene, rows.rays)
+    distant = transport.emission.kind == "cubemap"
+    ids, columns = np.meshgrid(rows.ids, elements, indexing="ij")
 
-    def direct(points: Points, basis: str) -> NDArray[np.float32]:
-        problem = replace(diffuse_problem(scene, lighting), basis=basis).at(points)
-        solver = DirectSolver(problem, parameters["strata"], parameters["seed"])
-        unit_albedo = solver.elements(*flat).reshape(len(vertices), -1, 1)
-        return transport.albedo[vertices][:, None] * unit_albedo
+    def direct(points: Points, basis: str) -> Floats:
+        problem = replace(diffuse_problem(scene, transport.emission), basis=basis).at(points)
+        listed = ids.ravel(), columns.ravel()
+        if distant:
+            unit_albedo = DirectSolver(problem, STRATA, seed).elements(*listed)[:, None]
+        else:
+            unit_albedo = LampRays(problem, STRATA, seed).elements(*listed).mean
+        return transport.albedo[rows.ids][:, None] * unit_albedo.reshape(*ids.shape, -1)
 
-    step = direct(hits, transport.basis) - direct(vertex_points(scene), transport.basis)
-    reference = ReferenceMatrix(scene, lighting, "direction", 2, vertices, rays).columns(texels, spp=1)
-    difference = np.abs(direct(hits, "direction") - reference)
-    different = (difference > GRAZED * np.abs(reference)).any(axis=2)
-    return ours + step, {
-        "direct_at_hits": float(different.mean()),
-        "hit_against_vertex": float(relative_l2(ours + step, ours)),
-    }
+    moved = ours + direct(hits, transport.basis) - direct(vertex_points(scene), transport.basis)
+    report = {"hit_against_vertex": float(relative_l2(moved, ours))}
+    if distant:
+        reference = ReferenceMatrix(scene, transport.emission, "direction", 2, rows.ids, rows.rays)
+        exact = reference.columns(elements, spp=1)
+        different = np.abs(direct(hits, "direction") - exact) > GRAZED * np.abs(exact)
+        report["direct_at_hits"] = float(different.any(axis=2).mean())
+    return moved, report
 
 
 def _image_error(
     scene: Scene,
     transport: LightTransport,
-    environment: mi.Emitter,
-    rays: VertexRays,
+    light: Any,
+    camera: mi.Sensor,
+    rays: VertexRays | None,
     width: int,
     spp: int,
     seed: int,
 ) -> tuple[dict[str, float], Figure]:
-    """A relit image against ``path`` under the same cubemap, in two halves, and what interpolation alone costs."""
+    """A relit image against ``path`` under the same light, in two halves, and what interpolation alone costs.
+
+    ``rays`` are those of vertices, None where rows are pixels, whose image keeps its size.
+    """
     from mi_sparse_prt.validation import matrix_figures as draw
 
-    lighting = transport.lighting.project(environment)
-    background = background_emitter(lighting, transport.lighting)
-    max_depth = transport.report["parameters"]["max_depth"]
-    sensor = scene.mitsuba.sensors()[0]
+    lighting = transport.emission.project(light)
     seeds = (2 * seed + 10, 2 * seed + 11)
-    with posed(sensor, width):
-        ours = render(scene, transport, lighting, sensor, spp=max(16, spp // 8), seed=seed)
-        halves = [reference_image(scene, background, sensor, max_depth, spp // 2, seed=k) for k in seeds]
+    with posed(camera, int(camera.film().size().x) if rays is None else width):
+        ours = [render(scene, transport, lighting, camera, max(16, spp // 8), seed=k) for k in seeds]
+        with transport.emission.scene_lit_by(lighting, scene) as lit:
+            halves = [path_image(lit, camera, transport.max_depth, spp // 2, seed=k) for k in seeds]
         exact = []  # images of Mitsuba's own vertices, interpolated as ours are
-        for k in seeds:
-            radiance = reference_vertices(scene, background, rays, max_depth, max(1, spp // 8), seed=k)
-            # a black albedo hides the irradiance from Mitsuba's radiance: there ours stands in
-            irradiance = np.divide(
-                radiance, scene.albedo, out=transport.irradiance(lighting), where=scene.albedo > 0.01
-            )
-            exact.append(
-                image_of_vertices(scene, irradiance, background, max(16, spp // 8), sensor, seed + 20)
-            )
-    reference = (halves[0] + halves[1]) / 2
+        if rays is not None and transport.emission.kind == "cubemap":
+            exact = [
+                _interpolated(scene, transport, lighting, camera, rays, spp, (k, seed + 20)) for k in seeds
+            ]
     x, y = (half.astype(np.float64) for half in halves)
-    flip = flip_map(reference, ours)
+    image, truth = (ours[0] + ours[1]) / 2, (halves[0] + halves[1]) / 2
+    flip = flip_map(truth, image)
     report = {
-        "relative_l2": relative_l2_without_noise(ours, x, y)[0],
-        "interpolation": relative_l2_without_noise(exact[0], x, y, exact[1])[0],
+        "relative_l2": relative_l2_without_noise(ours[0], x, y, ours[1])[0],
         "reference_noise": float(relative_l2_from_squares(((x - y) ** 2).sum() / 4, (x * y).sum())),
         "flip": float(flip.mean()),
     }
-    return report, draw.images(ours, reference, flip, report)
+    if exact:
+        report["interpolation"] = relative_l2_without_noise(exact[0], x, y, exact[1])[0]
+    return report, draw.images(image, truth, flip, report)
+
+
+def _interpolated(
+    scene: Scene,
+    transport: LightTransport,
+    lighting: Floats,
+    camera: mi.Sensor,
+    rays: VertexRays,
+    spp: int,
+    seeds: tuple[int, int],
+) -> Floats:
+    """An image of the radiance that Mitsuba itself finds at the vertices, interpolated as ours is."""
+    background, spp_of_vertices = background_emitter(lighting, transport.lighting), max(1, spp // 8)
+    radiance = reference_vertices(scene, background, rays, transport.max_depth, spp_of_vertices, seeds[0])
+    # a black albedo hides the irradiance from Mitsuba's radiance: there ours stands in
+    irradiance = np.divide(
+        radiance, scene.albedo, out=transport.irradiance(lighting), where=scene.albedo > 0.01
+    )
+    return image_of_vertices(scene, irradiance, background, max(16, spp // 8), camera, seeds[1])

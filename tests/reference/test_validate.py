@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt.transport import LightTransport, MeshRange
 from mi_sparse_prt.validation.glossy_images import validate_glossy
-from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix
+from mi_sparse_prt.validation.reference_matrix import ReferenceMatrix
 from mi_sparse_prt.validation.validate import matrix_errors
 
 LIGHTING = prt.CubemapLighting(2)
@@ -233,7 +233,7 @@ import mitsuba as mi
 import numpy as np
 import mi_sparse_prt as prt
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.validation.mitsuba_reference import reference_image
+from mi_sparse_prt.validation.mitsuba_reference import path_image
 
 T = mi.ScalarTransform4f
 lamp = {"type": "rectangle", "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], 90).scale(0.2),
@@ -245,7 +245,8 @@ film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
 camera = mi.load_dict({"type": "perspective", "to_world": view, "film": film})
 with_lamp = mi.render(scene.mitsuba, sensor=camera, integrator=mi.load_dict({"type": "path"}), spp=64)
 print(np.array(with_lamp).max())
-print(reference_image(scene, mi.load_dict({"type": "constant"}), camera, 3, spp=64, seed=0).max())
+with prt.CubemapLighting(1).scene_lit_by(1.0, scene) as lit:
+    print(path_image(lit, camera, 3, spp=64, seed=0).max())
 """
 
 

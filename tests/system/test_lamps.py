@@ -1,5 +1,7 @@
 """The scene's own emitters as columns: what Mitsuba's ``path`` renders with them, one at a time and all together."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.ndimage import binary_dilation
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import relative_l2_without_noise
 from mi_sparse_prt.measurement.vertices import sensor_points
+from mi_sparse_prt.operators.dense import Dense
 
 DEPTH = 4
 T = mi.ScalarTransform4f
@@ -126,6 +129,47 @@ def test_a_column_is_the_scene_with_one_lamp(scene, transport, name):
     assert np.allclose(column, transport.relight({name: 1.0}), atol=1e-6 * column.max())
     assert column.mean() == pytest.approx((x.mean() + y.mean()) / 2, rel=0.01)
     assert relative_l2_without_noise(column, x, y)[0] < 0.05
+
+
+def test_validation_sees_what_is_wrong_with_lamps(scene, transport):
+    """Rationale: `validate` renders each lamp alone; all rows of a few hundred vertices.
+
+    Expected: the error is that of finite elements (a few per cent); 5% too much light of one lamp, or two lamps that
+    changed places, are seen, and in the lamp that they are of.
+    """
+
+    def report(matrix: prt.LightTransport) -> dict:
+        return prt.validate(scene, matrix, n_rows=240, spp=256, progress=False, image=False).report
+
+    good = report(transport)
+    total = good["relative_l2"]["total"]
+    assert 0 < total < 0.05
+    assert good["hit_against_vertex"] < 0.05
+    names = transport.emission.names
+    factors = np.ones((4, 1), np.float32)
+    factors[names.index("beam")] = 1.3
+
+    def changed(order: list[int]) -> prt.LightTransport:
+        operators = {k: Dense((o.values * factors)[:, order]) for k, o in transport.operators.items()}
+        return replace(transport, operators=operators)
+
+    brighter = report(changed([0, 1, 2, 3]))
+    assert names[brighter["column_worst"]["lamp"]] == "beam"
+    assert brighter["column_worst"]["relative_l2"] == pytest.approx(0.3, rel=0.1)
+    factors[:] = 1.02
+    assert report(changed([0, 1, 2, 3]))["relative_l2"]["total"] == pytest.approx(
+        np.hypot(total, 0.02), rel=0.25
+    )
+    assert report(changed([1, 0, 2, 3]))["relative_l2"]["total"] > 0.5
+
+
+def test_a_picture_of_all_lamps_is_validated(scene, transport, tmp_path):
+    validation = prt.validate(
+        scene, transport, n_rows=24, spp=64, image_width=32, image_spp=128, progress=False
+    )
+    assert validation.report["image"]["relative_l2"] < 0.05
+    validation.save(tmp_path)
+    assert (tmp_path / "image.png").exists()
 
 
 def test_lamps_are_dimmed_coloured_and_grouped(scene, transport):

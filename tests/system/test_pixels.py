@@ -1,5 +1,7 @@
 """Rows at the pixels of a camera: textures at full resolution, no interpolation between vertices."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -90,21 +92,37 @@ def test_an_image_is_mitsubas(scene, transport, light, artefact):
 
     image = prt.render(scene, transport, light, spp=16)
     assert image.shape == (SIZE[1], SIZE[0], 3)
-    n = transport.emission.resolution
-    sky = {"type": "cubemap", "data": mi.TensorXf(light.reshape(6, n, n, 3)), "resolution": n}
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.unlit_shapes())}
-    reference = mi.load_dict({"type": "scene", **shapes, "sky": sky}, optimize=False)
-    path, camera = mi.load_dict({"type": "path", "max_depth": DEPTH}), scene.mitsuba.sensors()[0]
-    x, y = (
-        np.array(mi.render(reference, sensor=camera, integrator=path, spp=256, seed=seed))[..., :3]
-        for seed in (1, 2)
-    )
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    with transport.emission.scene_lit_by(light, scene) as lit:
+        x, y = (
+            np.array(mi.render(lit, sensor=scene.sensor(0), integrator=path, spp=256, seed=seed))[..., :3]
+            for seed in (1, 2)
+        )
     figure, axes = plt.subplots(1, 2)
     for axis, shown in zip(axes, (image, (x + y) / 2), strict=True):
         axis.imshow(np.clip(shown, 0, 1) ** (1 / 2.2))
     artefact(figure)
     assert image.mean() == pytest.approx((x.mean() + y.mean()) / 2, rel=0.01)
     assert relative_l2_without_noise(image, x, y)[0] < 0.05
+
+
+def test_validation_renders_whole_columns(scene, transport):
+    """Expected: the error is about what the matrix says of its points, and what 16 points a pixel cost; 5% show."""
+
+    def report(matrix: prt.LightTransport) -> dict:
+        return prt.validate(scene, matrix, n_columns=24, spp=2048, progress=False, image=False).report
+
+    good = report(transport)
+    total = good["relative_l2"]["total"]
+    assert transport.report["estimated_error"]["total"] / 2 < total < 0.06
+    assert good["parameters"]["rows"] == SIZE[0] * SIZE[1]
+    assert "hit_against_vertex" not in good
+    albedo = np.float32(1.05) * transport.albedo
+    brighter = report(replace(transport, reflection=replace(transport.reflection, albedo=albedo)))
+    assert brighter["relative_l2"]["total"] == pytest.approx(np.hypot(total, 0.05), rel=0.2)
+    away = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm"}})
+    with pytest.raises(prt.PrtError, match="pixels of another camera"):
+        prt.validate(scene, transport, sensor=away, progress=False)
 
 
 def test_rows_columns_products_and_files_are_one_matrix(transport, light, tmp_path):

@@ -23,7 +23,7 @@ from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
-from mi_sparse_prt.validation.mitsuba_reference import ReferenceMatrix
+from mi_sparse_prt.validation.reference_matrix import ReferenceMatrix
 
 LIGHTING = prt.CubemapLighting(8)
 N = LIGHTING.n_directions

@@ -49,6 +49,53 @@ def test_light_is_projected_or_refused(space):
         space.project(light)
 
 
+def path(lit: mi.Scene, camera: mi.Sensor, seed: int) -> np.ndarray:
+    """A small image of direct and once reflected light."""
+    integrator = mi.load_dict({"type": "path", "max_depth": 3})
+    return np.array(mi.render(lit, sensor=camera, integrator=integrator, spp=512, seed=seed))[..., :3]
+
+
+def test_scenes_are_lit_by_all_that_is_in_the_light(space, lit_scene):
+    """Mitsuba's images are linear in the light of a space: two halves of it, dimmed and coloured, add up.
+
+    Expected: equal within the noise, which the standard error over pixels tells; a colour or a factor that got lost
+    would be 10% and more.
+    """
+    camera = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([0, 2, 5], [0, 0.5, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}},
+        }
+    )
+    whole = path(lit_scene.mitsuba, camera, 9)
+    light = np.random.default_rng(3).random((space.size, 3)).astype(np.float32) + np.float32(0.2)
+    first = np.arange(space.size)[:, None] < space.size // 2
+    images = []
+    for seed, part in enumerate((light, light * first, light * ~first)):
+        with space.scene_lit_by(part, lit_scene) as lit:
+            images.append(path(lit, camera, seed))
+    both, difference = images[1] + images[2], images[0] - images[1] - images[2]
+    error = difference.std(axis=(0, 1)) / np.sqrt(difference[..., 0].size)
+    assert (error < 0.004 * both.mean(axis=(0, 1))).all()  # so that 2% would show
+    assert (np.abs(difference.mean(axis=(0, 1))) < 4 * error).all()
+    assert np.allclose(path(lit_scene.mitsuba, camera, 9), whole, atol=1e-4)  # the scene itself is as it was
+
+
+def test_a_coarser_version_and_the_way_back(space):
+    coarse = space.coarser(2)
+    if coarse is None:
+        assert (space.upsampling(space) != np.eye(space.size)).sum() == 0
+        assert space.sides is None
+        return
+    weights = space.upsampling(coarse)
+    assert weights.shape == (space.size, coarse.size) == (96, 24)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+    assert coarse.weights.sum() == pytest.approx(space.weights.sum())
+    with pytest.raises(prt.PrtError, match="not a power of two"):
+        space.coarser(8)
+
+
 def test_neighbours_begin_with_the_element_itself():
     lighting = prt.CubemapLighting(4)
     near = lighting.neighbours(9)

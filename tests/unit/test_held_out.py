@@ -10,7 +10,6 @@ from conftest import FORMS, T, altered, build, bumpy_ball, diffuse, made_up, sti
 from conftest import mesh as mesh_of
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.emission.upsampling import upsampling
 from mi_sparse_prt.estimation import element_sampling, held_out
 from mi_sparse_prt.estimation.element_sampling import Effort, for_direct_light, for_indirect_light
 from mi_sparse_prt.estimation.held_out import Sample, relative
@@ -397,7 +396,7 @@ def test_weighted_sums_are_those_of_all_elements(exact):
 def made_of_light(scene: prt.Scene, lighting: prt.CubemapLighting) -> Upsampled:
     """Indirect light of random size at each element."""
     density = np.random.default_rng(5).exponential(size=(scene.n_vertices, lighting.n_directions, 1))
-    return Upsampled(density.astype(np.float16), upsampling(lighting, lighting), lighting)
+    return Upsampled(density.astype(np.float16), lighting.upsampling(lighting), lighting)
 
 
 def test_every_vertex_is_looked_at_and_all_edges(exact):

@@ -215,7 +215,7 @@ def test_sensors_emitters_and_integrator_are_the_originals(tmp_path: Path) -> No
 def test_area_emitters_are_copied_to_the_world_scene_only() -> None:
     lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
     original = mi.load_dict({"type": "scene", "lamp": lamp, "floor": {"type": "rectangle"}})
-    with pytest.warns(PrtWarning, match="'lamp' is an area emitter: it does not take part"):
+    with pytest.warns(PrtWarning, match="'lamp' is an area emitter: matrices of lamps"):
         scene = Scene.from_mitsuba(original, INF)
     assert len(scene.warnings) == 1
     assert scene.normalised.emitters() == []

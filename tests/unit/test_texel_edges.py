@@ -12,8 +12,7 @@ from conftest import altered, build, bumpy_ball, diffuse, mesh, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.bits import above_horizon, pack, unpack
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES
-from mi_sparse_prt.emission.texel_adjacency import TexelSides
+from mi_sparse_prt.emission.cube_faces import FACE_FRAMES
 from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
@@ -45,7 +44,7 @@ def corners(n: int) -> list[list[tuple]]:
 @pytest.mark.parametrize("n", [1, 2, 4, 8])
 def test_pairs_are_the_texels_with_a_common_side(n):
     """Sides as pairs of corners on the cube: 12 n^2 of them, each of two texels, with the side's middle between."""
-    sides, at = TexelSides(prt.CubemapLighting(n)), corners(n)
+    sides, at = prt.CubemapLighting(n).sides, corners(n)
     owners: dict[frozenset, list[int]] = {}
     for texel, c in enumerate(at):
         for k in range(4):
@@ -71,7 +70,7 @@ def test_pairs_are_the_texels_with_a_common_side(n):
 @pytest.mark.parametrize("n", [1, 2, 4, 8])
 def test_quadrants_go_around_a_corner(n):
     """The texels A, B, C, D that a quadrant names have one point in common, or three of them at the cube's corners."""
-    sides, at = TexelSides(prt.CubemapLighting(n)), corners(n)
+    sides, at = prt.CubemapLighting(n).sides, corners(n)
     t = sides.tables
     missing = 0
     for a in range(6 * n * n):
@@ -101,7 +100,7 @@ def test_crossed_pairs_by_words_and_one_by_one(n):
     rng = np.random.default_rng(n)
     m = 6 * n * n
     seen, known = rng.random((5, m)) < 0.5, rng.random((5, m)) < 0.7
-    sides = TexelSides(prt.CubemapLighting(n))
+    sides = prt.CubemapLighting(n).sides
     a, b = sides.tables.first, sides.tables.second
     slow = (a != b) & known[:, a] & known[:, b] & (seen[:, a] != seen[:, b])
     assert slow.any()
@@ -351,7 +350,7 @@ def test_rays_are_those_that_were_traced(grey_scene):
     bits = bits_of(direct)
     direct.scene = CountingScene(direct.scene)
     part, rays = fractional_visibility(direct, bits)
-    sides = TexelSides(direct.lighting)
+    sides = direct.lighting.sides
     above = above_horizon(grey_scene.normals, direct.lighting.directions)
     crossed = np.bitwise_count(sides.find_crossed(bits, above)).sum()
     assert rays == STEPS * crossed

@@ -77,6 +77,7 @@ def made_up_glossy(form: str) -> LightTransport:
     return LightTransport(
         plain.emission,
         "texel" if "texels" in form else "direction",
+        5,
         Measurement(plain.measurement.keys, plain.measurement.areas, groups),
         surfaces,
         {"direct": direct, "indirect": indirect},

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.emission.cubemap import FACE_FRAMES
-from mi_sparse_prt.emission.upsampling import upsampling
+from mi_sparse_prt.emission.cube_faces import FACE_FRAMES
 
 PAIRS = [(1, 2), (1, 8), (2, 4), (2, 32), (4, 8), (8, 32), (16, 32)]
 
 
 def matrix(m: int, n: int):
-    return upsampling(prt.CubemapLighting(m), prt.CubemapLighting(n))
+    return prt.CubemapLighting(n).upsampling(prt.CubemapLighting(m))
 
 
 def smooth(directions: np.ndarray) -> np.ndarray:

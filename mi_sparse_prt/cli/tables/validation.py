@@ -9,6 +9,12 @@ from rich.table import Table
 from mi_sparse_prt.cli.tables.layout import new_table, percent, words
 from mi_sparse_prt.validation.glossy_images import CAUSES
 
+# of matrices that have them, see ``validate``
+AT_HITS = {
+    "direct_at_hits": "direct elements that differ by over 1e-4, share",
+    "hit_against_vertex": "Mitsuba's hit against the vertex itself",
+}
+
 
 def validation_table(report: dict[str, Any], title: str) -> Table:
     """Errors of rows, columns and image, and the reference's own noise (see ``Validation``)."""
@@ -20,16 +26,22 @@ def validation_table(report: dict[str, Any], title: str) -> Table:
     ]
     parts = [
         ("95th percentile of rows", percent(report["row_95th_percentile"])),
-        (f"worst row, vertex {row['vertex']}", percent(row["relative_l2"])),
-        (f"worst column, texel {column['texel']}", percent(column["relative_l2"])),
-        ("direct elements that differ by over 1e-4, share", percent(report["direct_at_hits"])),
-        ("Mitsuba's hit against the vertex itself", percent(report["hit_against_vertex"])),
+        *(
+            (f"worst {kind}, {name} {worst[name]}", percent(worst["relative_l2"]))
+            for kind, worst in (("row", row), ("column", column))
+            for name in worst.keys() - {"relative_l2"}
+        ),
+        *((title, percent(report[name])) for name, title in AT_HITS.items() if name in report),
     ]
     sections = [matrix, parts]
     if image := report.get("image"):
         relit = [
             ("relit image", percent(image["relative_l2"])),
-            ("of it, interpolation between vertices", percent(image["interpolation"])),
+            *(
+                [("of it, interpolation between vertices", percent(image["interpolation"]))]
+                if "interpolation" in image
+                else []
+            ),
             ("its reference's noise, not counted above", percent(image["reference_noise"])),
             ("FLIP, mean", f"{image['flip']:.4f}"),
         ]
