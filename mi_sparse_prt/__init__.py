@@ -15,6 +15,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.emission.cubemap import CubemapLighting
     from mi_sparse_prt.emission.emitters import SceneEmitters
     from mi_sparse_prt.emission.environment import Environment, load_environment
+    from mi_sparse_prt.measurement.measurement import mesh_vertices
     from mi_sparse_prt.measurement.pixels import camera_pixels
     from mi_sparse_prt.precompute import precompute, precompute_glossy
     from mi_sparse_prt.relighting.image import render
@@ -39,6 +40,7 @@ _MODULES = {
     "load_environment": "emission.environment",
     "load_scene": "scene.loading",
     "load_transport": "storage",
+    "mesh_vertices": "measurement.measurement",
     "precompute": "precompute",
     "precompute_glossy": "precompute",
     "render": "relighting.image",
@@ -60,6 +62,7 @@ __all__ = [
     "load_environment",
     "load_scene",
     "load_transport",
+    "mesh_vertices",
     "precompute",
     "precompute_glossy",
     "render",

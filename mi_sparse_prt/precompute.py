@@ -14,13 +14,13 @@ from mi_sparse_prt.core.profiling import Stopwatch, peak_memory, reset_peak_memo
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.emitters import SceneEmitters
+from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_of
-from mi_sparse_prt.methods.lamps import gathered_lamps, path_traced_lamps
+from mi_sparse_prt.methods.lamps import SPP, gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
@@ -41,7 +41,7 @@ _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces th
 
 def precompute(
     scene: Scene,
-    lighting: CubemapLighting | SceneEmitters,
+    lighting: CubemapLighting | SampledEmission,
     method: str | Plan = "auto",
     basis: str = "direction",
     max_depth: int = 5,
@@ -62,7 +62,7 @@ def precompute(
     Parameters
     ----------
     scene : Scene
-    lighting : CubemapLighting or SceneEmitters
+    lighting : CubemapLighting, SceneEmitters, or another ``emission.space.SampledEmission``
         The emission space: one column per texel, or per lamp. Of lamps, ``method`` is ``"gather"`` (diffuse scenes, the
         default there) or ``"brute_force"`` (64 paths per element, or ``spp``).
     method : {"auto", "brute_force", "sparse", "huang2010", "gather"} or Plan
@@ -127,15 +127,10 @@ def precompute(
     where = mesh_vertices(scene) if measurement is None else _of_scene(measurement, scene)
     folder = Path(checkpoint_folder) if checkpoint_folder else None
     run = Run(seed, progress=progress, checkpoint_folder=folder)
-    if isinstance(lighting, SceneEmitters):
-        if terms or harmonics is not None or target_error is not None:
-            raise PrtError(
-                "lamps: terms, harmonics and target_error are for light from a cubemap; leave them out"
-            )
-        problem = Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth)
-        return _lit_by_lamps(problem, method, spp, run)
+    if not isinstance(lighting, CubemapLighting):
+        _check_sampled(lighting, method, terms, harmonics, target_error, indirect_resolution)
     settings = Settings(
-        lighting.resolution,
+        lighting.resolution if isinstance(lighting, CubemapLighting) else 1,
         method,
         basis,
         max_depth,
@@ -149,6 +144,9 @@ def precompute(
         where.kind,
     )
     reset_peak_memory()
+    if not isinstance(lighting, CubemapLighting):
+        problem = Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth)
+        return _lit_by_lamps(problem, settings, run)
     with run.clock.phase("setup"):
         glossy = settings.view_dependent
         seen = vertex_reflection(scene, terms, harmonics) if glossy else _diffuse(scene, where)
@@ -241,37 +239,44 @@ def _diffuse(scene: Scene, where: Measurement) -> Diffuse:
     return Diffuse(scene.albedo if where.albedo is None else where.albedo)
 
 
-def _lit_by_lamps(problem: Problem, method: str | Plan, spp: int | None, run: Run) -> LightTransport:
-    """The matrix whose columns are the scene's own emitters."""
+def _check_sampled(
+    lighting: Any,
+    method: str | Plan,
+    terms: int,
+    harmonics: int | None,
+    target_error: float | None,
+    indirect_resolution: int | None,
+) -> None:
+    """Refuse what is for light from a cubemap alone."""
+    if not callable(getattr(lighting, "sample", None)):
+        raise PrtError(
+            f"lighting is {lighting!r}: give a CubemapLighting, SceneEmitters, or what samples its elements as these do"
+        )
+    if terms or any(value is not None for value in (harmonics, target_error, indirect_resolution)):
+        raise PrtError(
+            "lamps: terms, harmonics, target_error and indirect_resolution are for light from a cubemap; "
+            "leave them out"
+        )
     if method not in ("auto", "gather", "brute_force"):
         raise PrtError(f'method {method!r} knows no lamps; use "gather" or "brute_force", or leave it out')
-    reset_peak_memory()
+
+
+def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransport:
+    """The matrix whose columns are sampled emitters."""
+    method = settings.method
     if method == "gather" or (method == "auto" and problem.scene.diffuse):
-        name, parts = "gather", gathered_lamps(problem, run)
+        settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run)
     else:
-        name, parts = "brute_force", path_traced_lamps(problem, run, spp or 64)
+        settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
+        parts = path_traced_lamps(problem, run, settings.samples)
     transport = matrix_of(problem, parts)
     with run.clock.phase("held_out"):
         error = held_out_lamp_error(problem, transport, run.seed)
-    size = len(problem.points) * problem.emission.size
     transport.report.update(
-        {
-            "elements_total": size,
-            "elements_evaluated": parts.elements_evaluated,
-            "elements": parts.elements,
-            "rays": parts.rays,
-            "skipped": parts.skipped,
-            "estimated_error": error.report(),
-            "seed": run.seed,
-            "parameters": {
-                "method": name,
-                "max_depth": problem.max_depth,
-                "lamps": list(problem.emission.names),
-            },
-            "scene": problem.scene.summary,
-            "versions": versions(),
-        }
+        _account(parts, problem, [])
+        | {"estimated_error": error.report()}
         | _costs(transport, run.clock)
+        | _inputs(problem, settings)
     )
     return transport
 
@@ -363,9 +368,12 @@ def _costs(transport: LightTransport, clock: Stopwatch) -> dict[str, Any]:
 
 def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
     """What the matrix was made from, for the report."""
+    of_cubemap = isinstance(problem.emission, CubemapLighting)
+    sizes = {"resolution": settings.resolution, "indirect_resolution": settings.element_resolution}
     return {
         "seed": settings.seed,
-        "parameters": asdict(replace(settings, indirect_resolution=settings.element_resolution))
+        "parameters": asdict(settings)
+        | {name: size if of_cubemap else None for name, size in sizes.items()}
         | {"terms": problem.reflection.terms},
         "scene": problem.scene.summary,
         "versions": versions(),
@@ -374,19 +382,18 @@ def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
 
 def _account(parts: MethodResult, problem: Problem, skipped: list[str]) -> dict[str, Any]:
     """What was evaluated and what was not, for the report."""
-    above = share_above_horizon(problem.points, problem.emission)
+    skipped = [*skipped, *parts.skipped]
+    if isinstance(problem.emission, CubemapLighting):
+        above = share_above_horizon(problem.points, problem.emission)
+        skipped.append(f"direct rays below the horizon: {1 - above:.0%} of the elements")
     return {
-        "elements_total": len(problem.points) * problem.emission.n_directions,
+        "elements_total": len(problem.points) * problem.emission.size,
         "elements_evaluated": parts.elements_evaluated,
         "elements": parts.elements,
         "rays": parts.rays,
         "sampling": parts.sampling,
         "radiosity": parts.radiosity,
-        "skipped": [
-            *skipped,
-            *parts.skipped,
-            f"direct rays below the horizon: {1 - above:.0%} of the elements",
-        ],
+        "skipped": skipped,
     }
 
 

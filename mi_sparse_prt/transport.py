@@ -159,7 +159,9 @@ class LightTransport:
             If an index is out of range.
         """
         measurement, reflection = self.measurement, self.reflection
-        chosen = _checked(ids, measurement.outputs, "vertex" if measurement.kind == "vertices" else "pixel")
+        chosen = _checked(
+            ids, measurement.outputs, {"vertices": "vertex", "pixels": "pixel"}.get(measurement.kind, "row")
+        )
         if measurement.weights is None:
             return reflection.radiosity(self.incident.rows(reflection.rows_of(chosen)), chosen)
         weights = measurement.weights[chosen]

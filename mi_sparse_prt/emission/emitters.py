@@ -149,7 +149,13 @@ class SceneEmitters:
             rows = [np.broadcast_to(np.asarray(light.get(name, 0.0), np.float32), 3) for name in self.names]
             values = np.stack(rows)
         else:
-            values = np.asarray(light, np.float32)
+            try:
+                values = np.asarray(light, np.float32)
+            except (TypeError, ValueError):
+                raise PrtError(
+                    f"light of lamps is {type(light).__name__}: give names with values, such as "
+                    f"{{{self.names[0]!r}: 0.5}}"
+                ) from None
             if values.shape in ((), (self.size,)):
                 values = np.broadcast_to(values[..., None], (self.size, 3))
         if values.shape != (self.size, 3):

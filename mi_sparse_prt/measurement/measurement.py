@@ -56,7 +56,7 @@ class Measurement:
     groups : tuple of MeshRange
         They follow each other.
     kind : str
-        ``"vertices"`` or ``"pixels"``.
+        ``"vertices"``, ``"pixels"``, or what else its points are.
     normalised : Points, optional
         In the scene's normalised frame; None where the matrix came from a file without its scene.
     frame : ((3,) float64, float), optional

@@ -17,6 +17,7 @@ from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 
 BLOCK = 4096  # points at a time
+SPP = 64  # paths of an element, where nothing else says how many
 
 
 def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16) -> MethodResult:
@@ -48,7 +49,7 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
     return _result(problem, direct, indirect, {"direct": direct[..., 0].size * strata**2, "gather": traced})
 
 
-def path_traced_lamps(problem: Problem, run: Run, spp: int = 64, strata: int = 16) -> MethodResult:
+def path_traced_lamps(problem: Problem, run: Run, spp: int = SPP, strata: int = 16) -> MethodResult:
     """By path tracing: any BSDF."""
     direct = _direct(problem, run, strata)
     indirect = None

@@ -58,7 +58,7 @@ class Settings:
         if self.target_error is not None and not self.target_error > 0:
             raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
         self._check_terms()
-        if self.measurement == "pixels" and (self.view_dependent or self._needs_vertices):
+        if self.measurement != "vertices" and (self.view_dependent or self._needs_vertices):
             raise PrtError(
                 f"method {self._name!r} and terms of glossy surfaces are for the vertices of meshes; at pixels leave "
                 'both out, or set method="gather" or "brute_force"'
@@ -117,7 +117,7 @@ class Settings:
 
     def with_shares(self, plan: Plan) -> Plan:
         """A plan of finite elements; terms in the texel basis need shares of texels, pixels are nearer by them."""
-        needed = (self.view_dependent or self.measurement == "pixels") and self.basis == "texel"
+        needed = (self.view_dependent or self.measurement != "vertices") and self.basis == "texel"
         needed = needed and plan.indirect == "gather"
         return replace(plan, direct="edges") if needed else plan
 

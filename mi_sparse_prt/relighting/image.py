@@ -12,8 +12,8 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.emitters import SceneEmitters
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
@@ -39,8 +39,8 @@ class RelitScene:
         Irradiance / pi at the vertices: ``LightTransport.irradiance``.
     background : mi.Emitter or None
         What rays see that leave the scene.
-    lamps : (SceneEmitters, (size, 3) float32), optional
-        Emitters of the scene that are seen themselves, and how bright they are.
+    lamps : (SampledEmission, (size, 3) float32), optional
+        Light of the scene that is seen itself, and how bright they are.
 
     Notes
     -----
@@ -52,7 +52,7 @@ class RelitScene:
         scene: Scene,
         irradiance: NDArray[np.float32],
         background: mi.Emitter | None,
-        lamps: tuple[SceneEmitters, NDArray[np.float32]] | None = None,
+        lamps: tuple[SampledEmission, NDArray[np.float32]] | None = None,
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
@@ -247,8 +247,8 @@ def check_camera(transport: LightTransport, sensor: mi.Sensor) -> None:
 
 def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> RelitScene:
     """What a camera sees: of a matrix of pixels nothing but the lights themselves, of others the surfaces, too."""
-    if isinstance(transport.emission, SceneEmitters):
-        background, lamps = None, (transport.emission, transport.emission.project(environment))
+    if transport.emission.kind != CubemapLighting.kind:
+        background, lamps = None, (transport.lighting, transport.emission.project(environment))
     else:
         background, lamps = background_emitter(environment, transport.lighting), None
     if transport.terms:

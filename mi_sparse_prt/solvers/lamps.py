@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import random_generator
-from mi_sparse_prt.emission.emitters import SceneEmitters
+from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, trace_reflected
@@ -32,7 +32,7 @@ class LampRays:
     """
 
     def __init__(self, problem: Problem, strata: int = 16, seed: int = 0) -> None:
-        self._emission: SceneEmitters = problem.emission
+        self._emission: SampledEmission = problem.emission
         self._scene, self._strata, self._seed = problem.scene, strata, seed
         self._points = PointArrays(problem.points)
 

@@ -11,12 +11,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import (
     flip_map,
     relative_l2,
     relative_l2_from_squares,
     relative_l2_of_rows,
     relative_l2_without_noise,
+    relative_noise,
 )
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.relighting.image import background_emitter, check_camera, render
@@ -165,8 +167,8 @@ def validate(
     light = scene.mitsuba.environment() if distant else 1.0
     if image and light is not None and (rows.camera or scene.mitsuba.sensors()):
         camera = rows.camera or scene.sensor(sensor)
-        found = _image_error(scene, transport, light, camera, rows.rays, image_width, image_spp, seed)
-        report["image"], figures["image"] = found
+        picture = _Picture(camera, rows.rays, image_width, image_spp, seed)
+        report["image"], figures["image"] = picture.error(scene, transport, light)
     return Validation(report, figures)
 
 
@@ -186,6 +188,8 @@ def _chosen_rows(
     if transport.measurement.kind == "vertices":
         ids = _stratified_vertices(transport.meshes, n_rows, rng)
         return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised))
+    if transport.measurement.image is None:
+        raise PrtError(f"validate renders vertices and pixels, not {transport.measurement.kind!r}")
     camera, pixels = scene.sensor(sensor), transport.shape[0]
     check_camera(transport, camera)
     groups = (MeshRange("image", slice(0, pixels)),)
@@ -303,60 +307,48 @@ def _moved_to_hits(
     return moved, report
 
 
-def _image_error(
-    scene: Scene,
-    transport: LightTransport,
-    light: Any,
-    camera: mi.Sensor,
-    rays: VertexRays | None,
-    width: int,
-    spp: int,
-    seed: int,
-) -> tuple[dict[str, float], Figure]:
-    """A relit image against ``path`` under the same light, in two halves, and what interpolation alone costs.
+@dataclass(frozen=True)
+class _Picture:
+    """The image that is compared: ``rays`` are those of vertices, None where rows are pixels (its width is theirs)."""
 
-    ``rays`` are those of vertices, None where rows are pixels, whose image keeps its size.
-    """
-    from mi_sparse_prt.validation import matrix_figures as draw
+    camera: mi.Sensor
+    rays: VertexRays | None
+    width: int
+    spp: int
+    seed: int
 
-    lighting = transport.emission.project(light)
-    seeds = (2 * seed + 10, 2 * seed + 11)
-    with posed(camera, int(camera.film().size().x) if rays is None else width):
-        ours = [render(scene, transport, lighting, camera, max(16, spp // 8), seed=k) for k in seeds]
-        with transport.emission.scene_lit_by(lighting, scene) as lit:
-            halves = [path_image(lit, camera, transport.max_depth, spp // 2, seed=k) for k in seeds]
+    def error(self, scene: Scene, transport: LightTransport, light: Any) -> tuple[dict[str, float], Figure]:
+        """Against ``path`` under the same light, in two halves, and what interpolation alone costs."""
+        from mi_sparse_prt.validation import matrix_figures as draw
+
+        lighting, seeds = transport.emission.project(light), (2 * self.seed + 10, 2 * self.seed + 11)
+        camera, spp = self.camera, max(16, self.spp // 8)
         exact = []  # images of Mitsuba's own vertices, interpolated as ours are
-        if rays is not None and transport.emission.kind == "cubemap":
-            exact = [
-                _interpolated(scene, transport, lighting, camera, rays, spp, (k, seed + 20)) for k in seeds
-            ]
-    x, y = (half.astype(np.float64) for half in halves)
-    image, truth = (ours[0] + ours[1]) / 2, (halves[0] + halves[1]) / 2
-    flip = flip_map(truth, image)
-    report = {
-        "relative_l2": relative_l2_without_noise(ours[0], x, y, ours[1])[0],
-        "reference_noise": float(relative_l2_from_squares(((x - y) ** 2).sum() / 4, (x * y).sum())),
-        "flip": float(flip.mean()),
-    }
-    if exact:
-        report["interpolation"] = relative_l2_without_noise(exact[0], x, y, exact[1])[0]
-    return report, draw.images(image, truth, flip, report)
+        with posed(camera, int(camera.film().size().x) if self.rays is None else self.width):
+            ours = [render(scene, transport, lighting, camera, spp, seed=k) for k in seeds]
+            with transport.emission.scene_lit_by(lighting, scene) as lit:
+                halves = [path_image(lit, camera, transport.max_depth, self.spp // 2, seed=k) for k in seeds]
+            if self.rays is not None and transport.emission.kind == "cubemap":
+                exact = [self._interpolated(scene, transport, lighting, seed=k) for k in seeds]
+        x, y = (half.astype(np.float64) for half in halves)
+        image, truth = (ours[0] + ours[1]) / 2, (halves[0] + halves[1]) / 2
+        flip = flip_map(truth, image)
+        report = {
+            "relative_l2": relative_l2_without_noise(ours[0], x, y, ours[1])[0],
+            "reference_noise": relative_noise(x, y),
+            "flip": float(flip.mean()),
+        }
+        if exact:
+            report["interpolation"] = relative_l2_without_noise(exact[0], x, y, exact[1])[0]
+        return report, draw.images(image, truth, flip, report)
 
-
-def _interpolated(
-    scene: Scene,
-    transport: LightTransport,
-    lighting: Floats,
-    camera: mi.Sensor,
-    rays: VertexRays,
-    spp: int,
-    seeds: tuple[int, int],
-) -> Floats:
-    """An image of the radiance that Mitsuba itself finds at the vertices, interpolated as ours is."""
-    background, spp_of_vertices = background_emitter(lighting, transport.lighting), max(1, spp // 8)
-    radiance = reference_vertices(scene, background, rays, transport.max_depth, spp_of_vertices, seeds[0])
-    # a black albedo hides the irradiance from Mitsuba's radiance: there ours stands in
-    irradiance = np.divide(
-        radiance, scene.albedo, out=transport.irradiance(lighting), where=scene.albedo > 0.01
-    )
-    return image_of_vertices(scene, irradiance, background, max(16, spp // 8), camera, seeds[1])
+    def _interpolated(self, scene: Scene, transport: LightTransport, lighting: Floats, seed: int) -> Floats:
+        """An image of the radiance that Mitsuba itself finds at the vertices, interpolated as ours is."""
+        assert self.rays is not None
+        background, spp = background_emitter(lighting, transport.lighting), max(1, self.spp // 8)
+        radiance = reference_vertices(scene, background, self.rays, transport.max_depth, spp, seed)
+        # a black albedo hides the irradiance from Mitsuba's radiance: there ours stands in
+        irradiance = np.divide(
+            radiance, scene.albedo, out=transport.irradiance(lighting), where=scene.albedo > 0.01
+        )
+        return image_of_vertices(scene, irradiance, background, max(16, spp), self.camera, self.seed + 20)

@@ -1,5 +1,6 @@
 """The scene's own emitters as columns: what Mitsuba's ``path`` renders with them, one at a time and all together."""
 
+import json
 from dataclasses import replace
 
 import mitsuba as mi
@@ -7,8 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
+from typer.testing import CliRunner
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.cli import app
 from mi_sparse_prt.core.metrics import relative_l2_without_noise
 from mi_sparse_prt.measurement.vertices import sensor_points
 from mi_sparse_prt.operators.dense import Dense
@@ -220,6 +223,17 @@ def test_a_picture_at_its_pixels(scene, lamps, artefact):
     assert relative_l2_without_noise(image[dim], x[dim], y[dim])[0] < 0.04
 
 
+def test_the_command_line_tells_what_a_file_of_lamps_holds(transport, tmp_path):
+    transport.save(tmp_path / "a.prt")
+    result = CliRunner().invoke(app, ["info", str(tmp_path / "a.prt"), "--json", str(tmp_path / "a.json")])
+    assert result.exit_code == 0, result.output
+    assert "vertices x 4 lamps" in " ".join(result.output.split())
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert report["parameters"]["method"] == "gather"
+    assert report["parameters"]["max_depth"] == DEPTH
+    assert report["elements_total"] == 4 * transport.shape[0]
+
+
 def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
     transport.save(tmp_path / "a.prt")
     loaded = prt.load_transport(tmp_path / "a.prt")
@@ -236,6 +250,7 @@ def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
         ({"lamp": 1.0}, "there is no lamp 'lamp'; there are: panel"),
         ([1.0, 2.0], "light has shape"),
         ({"beam": np.nan}, "NaN"),
+        (object(), "give names with values, such as {'panel': 0.5}"),
     ],
 )
 def test_bad_light_is_one_line(transport, light, words):

@@ -34,7 +34,7 @@ def matrix_tables(transport: prt.LightTransport, path: Path, explain: bool = Fal
 
 def _done_table(transport: prt.LightTransport, path: Path) -> Table:
     """What was done."""
-    report, (vertices, directions, _) = transport.report, transport.shape
+    report, (outputs, elements, _) = transport.report, transport.shape
     labels = {"direct": "shadow rays", "indirect_paths": "indirect paths"}
     rows = [
         ("elements", f"{report['elements_total']:,}"),
@@ -56,7 +56,10 @@ def _done_table(transport: prt.LightTransport, path: Path) -> Table:
         *((f"scene {name}", str(report["scene"][name])) for name in ("path", "hash")),
         ("versions", listed(report["versions"])),
     ]
-    title = f"{path}: {vertices} vertices x {directions} directions, {transport.basis} basis"
+    rows_of, columns = transport.measurement.kind, f"{elements} lamps"
+    if transport.emission.kind == "cubemap":
+        columns = f"{elements} directions, {transport.basis} basis"
+    title = f"{path}: {outputs} {rows_of} x {columns}"
     return new_table(title, FACTS, rows)
 
 
@@ -71,8 +74,9 @@ def _time_table(report: dict[str, Any]) -> Table:
     sums = [
         ("total", duration(seconds["total"]), ""),
         ("compile, apart", duration(seconds["compile"]), ""),
-        ("forecast", duration(report["forecast"]["seconds"]), ""),
     ]
+    if "forecast" in report:
+        sums.append(("forecast", duration(report["forecast"]["seconds"]), ""))
     return new_table("Time", ("phase", "time", "share"), phases, sums)
 
 
