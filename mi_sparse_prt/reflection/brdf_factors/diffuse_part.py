@@ -60,12 +60,32 @@ class GlossyPart:
 
     def values(self, incident: Floats, outgoing: Floats) -> Floats:
         """Glossy BRDF times the incident cosine, (m, channels), at pairs of directions (m, 3)."""
-        value = evaluate_brdf(self._bsdf, self._name, incident, outgoing)[:, : self.channels]
-        cosine = np.where(outgoing[:, 2] > 0, np.maximum(incident[:, 2], 0), 0)
-        lambertian = cosine[:, None] * (self.diffuse[: self.channels] / np.pi).astype(np.float32)
-        part: Floats = value - lambertian
-        part[np.abs(part) <= ROUNDING * lambertian] = 0
-        return part
+        light, view = (mi.Vector3f(np.ascontiguousarray(w.T)) for w in (incident, outgoing))
+        return np.stack([channel.numpy() for channel in self._glossy(light, view)], axis=1)
+
+    def rows(self, grid: DirectionGrid, some: slice) -> Floats:
+        """The same, (b, channels, outgoing), for some of a grid's incident directions and all outgoing ones."""
+        n, count = len(grid.directions), some.stop - some.start
+        every = mi.Vector3f(np.ascontiguousarray(grid.directions.T))
+        lane = dr.arange(mi.UInt32, count * n)
+        row = lane // dr.opaque(mi.UInt32, n)
+        light = dr.gather(mi.Vector3f, every, row + dr.opaque(mi.UInt32, some.start))
+        channels = self._glossy(light, dr.gather(mi.Vector3f, every, lane - row * dr.opaque(mi.UInt32, n)))
+        return np.stack([channel.numpy().reshape(count, n) for channel in channels], axis=1)
+
+    def _glossy(self, light: mi.Vector3f, view: mi.Vector3f) -> list[mi.Float]:
+        """Channels at pairs of directions, the incident ones first."""
+        value = _evaluate(
+            self._bsdf, self._name, dr.zeros(mi.SurfaceInteraction3f, dr.width(light)), light, view
+        )
+        cosine = dr.select(view.z > 0, dr.maximum(light.z, 0), 0)
+        channels = []
+        for c in range(self.channels):
+            lambertian = cosine * mi.Float(dr.opaque(mi.Float, float(np.float32(self.diffuse[c] / np.pi))))
+            part = value[c] - lambertian
+            channels.append(dr.select(dr.abs(part) <= ROUNDING * lambertian, 0, part))
+        dr.eval(channels)
+        return channels
 
 
 def diffuse_reflectance(bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f) -> Floats:
@@ -113,17 +133,26 @@ def _evaluate_at(
     bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f, incident: Floats, outgoing: Floats
 ) -> Floats:
     """As `evaluate_brdf`, at places, whose directions are overwritten."""
-    si.wi = mi.Vector3f(np.ascontiguousarray(outgoing.T))  # Mitsuba's wi is where the light leaves for
-    light = mi.Vector3f(np.ascontiguousarray(incident.T))
-    value = np.array(dr.zeros(mi.Color3f, len(incident)) + bsdf.eval(mi.BSDFContext(), si, light)).T
-    bad = np.flatnonzero(~np.isfinite(value).all(axis=1))
-    if bad.size:
-        raise PrtError(
-            f"shape '{name}': its BSDF is {value[bad[0]].tolist()} for light from {incident[bad[0]].tolist()}; "
-            "correct the BSDF's parameters or use path tracing instead"
-        )
-    found: Floats = np.asarray(value, np.float32)
+    light, view = (mi.Vector3f(np.ascontiguousarray(w.T)) for w in (incident, outgoing))
+    found: Floats = np.asarray(np.array(_evaluate(bsdf, name, si, light, view)).T, np.float32)
     return found
+
+
+def _evaluate(
+    bsdf: mi.BSDF, name: str, si: mi.SurfaceInteraction3f, light: mi.Vector3f, view: mi.Vector3f
+) -> mi.Color3f:
+    """As `_evaluate_at`, on the device."""
+    si.wi = view  # Mitsuba's wi is where the light leaves for
+    value = dr.zeros(mi.Color3f, dr.width(light)) + bsdf.eval(mi.BSDFContext(), si, light)
+    wrong = ~dr.all(dr.isfinite(value))
+    dr.eval(value, wrong)
+    if dr.any(wrong):
+        first = int(np.flatnonzero(wrong.numpy())[0])
+        raise PrtError(
+            f"shape '{name}': its BSDF is {np.array(value)[:, first].tolist()} for light from "
+            f"{np.array(light)[:, first].tolist()}; correct the BSDF's parameters or use path tracing instead"
+        )
+    return value
 
 
 def _check(bsdf: mi.BSDF, name: str) -> bool:

@@ -162,13 +162,11 @@ def glossy_rows(
 
     As many as make ``lanes`` values of the BRDF.
     """
-    every = grid.directions
-    step = max(1, lanes // len(every))
-    for a in range(0, len(every), step):
-        some = slice(a, min(a + step, len(every)))
-        w = every[some]
-        values = part.values(np.repeat(w, len(every), axis=0), np.tile(every, (len(w), 1)))
-        yield some, np.moveaxis(values.reshape(len(w), len(every), -1), 2, 1)
+    n = len(grid.directions)
+    step = max(1, lanes // n)
+    for a in range(0, n, step):
+        some = slice(a, min(a + step, n))
+        yield some, part.rows(grid, some)
 
 
 def _weights(grid: DirectionGrid) -> tuple[Doubles, Doubles]:
