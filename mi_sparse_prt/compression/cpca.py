@@ -181,8 +181,7 @@ def fit_spaces(rows: Floats, weights: Floats, clusters: Clusters, bases: int, ce
 
     def fit(turns: Indices) -> None:
         for c in turns:
-            own, shares = rows[items[c]].reshape(-1, m), np.repeat(weights[items[c]], g)
-            means[c], found = affine_space(own, shares, bases, start[c], centred, random)
+            means[c], found = _space_of(rows, weights, items[c], bases, start[c], centred, random)
             vectors[c, : len(found)] = found
 
     # threads of Python: in a parallel loop of numba, all of `affine_space` would be compiled three times over
@@ -190,6 +189,18 @@ def fit_spaces(rows: Floats, weights: Floats, clusters: Clusters, bases: int, ce
     with one_blas_thread(), ThreadPoolExecutor(threads) as pool:
         list(pool.map(fit, [sizes[t::threads] for t in range(threads)]))  # large and small ones for each
     return Clusters(clusters.labels, means, vectors)
+
+
+@numba.njit(nogil=True, cache=True)
+def _space_of(
+    rows: Floats, weights: Floats, items: Indices, bases: int, start: Floats, centred: bool, random: Floats
+) -> tuple[Floats, Floats]:
+    """``affine_space`` of some items; they are gathered here, where threads do not wait for each other."""
+    g, m = rows.shape[1:]
+    own, shares = np.empty((len(items) * g, m), np.float32), np.empty(len(items) * g, np.float32)
+    for i in range(len(own)):
+        own[i], shares[i] = rows[items[i // g], i % g], weights[items[i // g]]
+    return affine_space(own, shares, bases, start, centred, random)
 
 
 def random_mixtures(rows: int, missing: int) -> Floats:

@@ -27,6 +27,8 @@ def wait_passively() -> None:
 @cache
 def _libraries() -> ThreadpoolController:
     """Those whose threads can be limited; to look for them takes 3 ms."""
+    import scipy.linalg.cython_blas  # noqa: F401 - numba's BLAS: not found here, it would never be limited
+
     return ThreadpoolController()
 
 

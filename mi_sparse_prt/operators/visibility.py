@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numba
@@ -57,8 +58,7 @@ class Visibility(Operator):
         return self.bits
 
     def rows(self, ids: Ids) -> Floats:
-        weighted = np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
-        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), weighted)[..., None]
+        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), self._weighted)[..., None]
 
     def columns(self, ids: Ids) -> Floats:
         return self.dense_columns(ids, np.empty((len(self.bits), len(ids)), np.float32))[..., None]
@@ -99,6 +99,11 @@ class Visibility(Operator):
 
     def check(self) -> None:
         check_bits(self.bits, self.normals, self.lighting)
+
+    @cached_property
+    def _weighted(self) -> Floats:
+        """Directions (3, n_directions) times their weights; kept, as rows are expanded few at a time."""
+        return np.ascontiguousarray((self.lighting.directions * self._weights()[:, None]).T)
 
     def _weights(self) -> Floats:
         return self.lighting.solid_angles / np.float32(np.pi)

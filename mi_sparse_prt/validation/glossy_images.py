@@ -49,6 +49,7 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Halves = tuple[Image, Image]  # two images that differ in their noise
 
+PATHS = ("real", "factored", "directions")  # what `path` renders
 # what differs in two images: (image, what it is compared with)
 CAUSES = {
     "total": ("ours", "real"),
@@ -229,16 +230,15 @@ class _References:
         }
         self._depth = MOST_BOUNCES if transport.max_depth < 0 else transport.max_depth
 
-    def rendered(self, sensor: mi.Sensor, spp: int, seeds: tuple[int, ...]) -> dict[str, Halves]:
-        """``ours``, ``real``, ``factored`` and ``directions``."""
+    def rendered(
+        self, sensor: mi.Sensor, spp: int, seeds: tuple[int, ...], paths: Sequence[str] = PATHS
+    ) -> dict[str, Halves]:
+        """``ours``, and what Mitsuba's ``path`` makes of the scene in its several forms."""
         halves: list[dict[str, Image]] = []
         for k in (0, 1):
             # the same numbers for all: noise that two images have in common is not in their difference
             own = _seed(*seeds, k)
-            one = {
-                name: self._path(name, sensor, self._depth, spp // 2, own)
-                for name in ("real", "factored", "directions")
-            }
+            one = {name: self._path(name, sensor, self._depth, spp // 2, own) for name in paths}
             one["directions"] += self._path("diffuse", sensor, 1, spp // 2, own)  # the sky
             one["ours"] = render(self._scene, self._transport, self._radiance, sensor, spp // 2, own)
             halves.append(one)

@@ -128,7 +128,9 @@ def check(reports: list[dict], true: dict[str, float]) -> None:
 # ------------------------------------------------------------------------------------ against the truth
 
 
-@pytest.mark.parametrize("colour", [True, False], ids=["colour", "grey"])
+@pytest.mark.parametrize(
+    "colour", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["colour", "grey"]
+)
 def test_radiance_and_terms(colour):
     """Rationale: elements that no ray of the matrix found tell how far it is off: radiance, squares averaged over views
     by their cosine, and each term by itself.

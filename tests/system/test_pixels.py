@@ -110,7 +110,7 @@ def test_validation_renders_whole_columns(scene, transport):
     """Expected: the error is about what the matrix says of its points, and what 16 points a pixel cost; 5% show."""
 
     def report(matrix: prt.LightTransport) -> dict:
-        return prt.validate(scene, matrix, n_columns=24, spp=2048, progress=False, image=False).report
+        return prt.validate(scene, matrix, n_columns=12, spp=1024, progress=False, image=False).report
 
     good = report(transport)
     total = good["relative_l2"]["total"]

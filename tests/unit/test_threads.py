@@ -1,5 +1,6 @@
 """How libraries share the cores: order, errors and limits of overlapped tasks; what importing the package sets."""
 
+import json
 import os
 import subprocess
 import sys
@@ -65,3 +66,25 @@ def test_waiting_threads_sleep_unless_they_are_told_otherwise(given: str | None,
     code = "import os, mi_sparse_prt; print(os.environ['OMP_WAIT_POLICY'])"
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert run.stdout.split() == [expected], run.stderr
+
+
+LATE_LIBRARY = """
+import numpy as np, numba
+from threadpoolctl import threadpool_info
+from mi_sparse_prt.core.threads import one_blas_thread
+
+product = numba.njit(lambda a: np.dot(a, a))
+with one_blas_thread():
+    product(np.ones((8, 8)))
+    print([p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"])
+"""
+
+
+def test_libraries_that_numba_loads_later_are_limited_too() -> None:
+    """numba's products are those of SciPy's BLAS, which is loaded with the first of them."""
+    run = subprocess.run(
+        [sys.executable, "-c", LATE_LIBRARY], capture_output=True, text=True, check=True, timeout=120
+    )
+    limits = json.loads(run.stdout)
+    assert len(limits) >= 2
+    assert set(limits) == {1}
