@@ -33,6 +33,7 @@ class Dense(Operator):
     values: NDArray[np.float32]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.values.ndim != 3 or self.values.shape[2] not in (1, 3):
             raise PrtError(f"Dense: values must be (rows, columns, 1 or 3), not {self.values.shape}")
         if not np.isfinite(self.values).all():

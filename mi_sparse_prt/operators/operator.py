@@ -53,6 +53,15 @@ class Operator(ABC):
     dark_below_horizon: ClassVar[bool] = False
     element_block: ClassVar[int] = ROWS
 
+    def __post_init__(self) -> None:
+        self.__setstate__(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See all arrays read-only: a kernel is compiled once, whether they were computed, read or unpickled."""
+        own = {field.name: state[field.name] for field in fields(self)}
+        kept = {name: read_only(value) for name, value in own.items() if isinstance(value, np.ndarray)}
+        self.__dict__.update(state | kept)
+
     @property
     @abstractmethod
     def shape(self) -> tuple[int, int, int]:
@@ -282,6 +291,13 @@ class Masked(Operator):
         result, some = np.ones(len(rows), np.bool_), np.isin(rows, self.points)
         result[some] = bits_at(self.open, np.searchsorted(self.points, rows[some]), texels[some])
         return result
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A view that cannot be written to."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:

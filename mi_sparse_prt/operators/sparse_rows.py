@@ -34,6 +34,7 @@ class SparseRows(Operator):
     matrices: tuple[scipy.sparse.csr_array, ...]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not all(np.isfinite(matrix.data).all() for matrix in self.matrices):
             raise PrtError("SparseRows: values are NaN or infinite; repair what they were computed from")
 

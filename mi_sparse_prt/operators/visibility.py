@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Floats, Ids, Operator
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator, read_only
 
 #: Bits of texels; where those that are seen in part begin in two lists; these texels, and their shares.
 SeenTexels = tuple[Bits, NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]
@@ -50,8 +50,8 @@ class Visibility(Operator):
     @property
     def seen(self) -> SeenTexels:
         """Bits, and no texels that are seen in part (``FractionalVisibility.seen``)."""
-        starts = np.zeros(len(self.bits) + 1, np.int64)
-        return self.bits, starts, np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+        starts = read_only(np.zeros(len(self.bits) + 1, np.int64))
+        return self.bits, starts, read_only(np.zeros(0, np.uint16)), read_only(np.zeros(0, np.uint8))
 
     @property
     def edges(self) -> Bits | None:

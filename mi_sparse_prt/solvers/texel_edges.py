@@ -120,7 +120,10 @@ def _cut_texels(
     threads = numba.get_num_threads()
     _find_shares(sides.tables, bits, above, horizon, crossings, threads, room, seen, entries, number)
     starts = row_starts(number)
-    texels, shares = np.empty(starts[-1], np.min_scalar_type(m - 1)), np.empty(starts[-1], np.uint8)
+    kind = np.result_type(
+        np.uint16, np.min_scalar_type(m - 1)
+    )  # 16 bits at least: one compiled kernel for most
+    texels, shares = np.empty(starts[-1], kind), np.empty(starts[-1], np.uint8)
     _unpack(entries, room, starts, texels, shares)
     return seen, number, texels, shares
 
