@@ -160,7 +160,8 @@ def test_the_error_of_brute_force(coloured):
     assert more.report["estimated_error"]["total"] == pytest.approx(true["total"] / 4, rel=0.25)
 
 
-def test_texels():
+@pytest.mark.parametrize("max_depth", [pytest.param(2, marks=pytest.mark.slow), 5])
+def test_texels(max_depth):
     """Rationale: in the texel basis a term has the visible share of a texel times f_k at its centre, which at 6 x 4 x 4
     texels is 5% off, 14% in the second term. The truth has rays in 8 x 8 strata of each texel.
 
@@ -169,18 +170,15 @@ def test_texels():
     Result: 5.0% and 5.1%; terms 5.2% and 14%.
     """
     scene = scene_of(True)
-    for max_depth in (2, 5):
-        transport = precompute(method="gather", basis="texel", max_depth=max_depth)
-        assert transport.report["plan"]["direct"] == "edges"
-        assert transport.basis == "texel"
-        problem = problem_of(scene, transport, max_depth)
-        truth = [direct_by_rays(problem, seed) for seed in (50, 51)]
-        if max_depth > 2:
-            truth = [
-                rows + indirect_by_paths(problem, seed) for rows, seed in zip(truth, (60, 61), strict=True)
-            ]
-        true = true_errors(transport, rows_of(transport), *truth)
-        check([held_out_error(problem, transport, seed, effort=EFFORT).report() for seed in SEEDS], true)
+    transport = precompute(method="gather", basis="texel", max_depth=max_depth)
+    assert transport.report["plan"]["direct"] == "edges"
+    assert transport.basis == "texel"
+    problem = problem_of(scene, transport, max_depth)
+    truth = [direct_by_rays(problem, seed) for seed in (50, 51)]
+    if max_depth > 2:
+        truth = [rows + indirect_by_paths(problem, seed) for rows, seed in zip(truth, (60, 61), strict=True)]
+    true = true_errors(transport, rows_of(transport), *truth)
+    check([held_out_error(problem, transport, seed, effort=EFFORT).report() for seed in SEEDS], true)
 
 
 def direct_by_rays(problem: Problem, seed: int) -> Doubles:

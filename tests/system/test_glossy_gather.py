@@ -205,7 +205,11 @@ def corner(edge_length: float, floor: object, wall: object) -> Scene:
 
 
 @pytest.mark.parametrize(
-    ("floor", "max_depth"), [(diffuse(0.6, 0.6, 0.6), 3), (PHONG, 5)], ids=["diffuse", "glossy"]
+    ("floor", "max_depth"),
+    [
+        pytest.param(diffuse(0.6, 0.6, 0.6), 3, marks=pytest.mark.slow, id="diffuse"),
+        pytest.param(PHONG, 5, id="glossy"),
+    ],
 )
 def test_a_brushed_wall_behind_a_floor(artefact, floor, max_depth):
     """Rationale: surfaces see glossy light. Paths ask a BSDF that is exactly the sum of products which finite elements

@@ -187,7 +187,7 @@ def assert_normal(result: Comparison) -> None:
         assert stats.kstest(result.scaled(factor).row_z, "norm").pvalue < 1e-3
 
 
-@pytest.mark.parametrize("max_depth", [3, 5])
+@pytest.mark.parametrize("max_depth", [pytest.param(3, marks=pytest.mark.slow), 5])
 def test_grey_scene(grey_scene, artefact, max_depth):
     """Rationale: one interreflection and three, in the direction basis, one channel for all.
 

@@ -64,6 +64,7 @@ def test_vertices_have_no_radiance_of_their_own(folder, matrix, environment):
     assert not (folder / "a.npy").exists()
 
 
+@pytest.mark.slow  # a minute of compilation; the same images from Python are in tests/system/test_glossy_images.py
 def test_validate_splits_the_error(folder, scene, matrix):
     result = call("validate", scene, matrix, "--image-spp", 4, "-o", folder / "validation")
     assert result.exit_code == 0, result.stderr

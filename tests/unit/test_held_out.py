@@ -249,7 +249,7 @@ def test_a_target_far_off_takes_a_quarter(exact):
 @pytest.mark.parametrize(
     ("method", "basis"),
     [
-        ("brute_force", "direction"),
+        pytest.param("brute_force", "direction", marks=pytest.mark.slow),
         ("brute_force", "texel"),
         ("sparse", "direction"),
         ("huang2010", "direction"),
