@@ -163,6 +163,7 @@ class _Attempts:
         self._dark = _no_indirect(direct.problem, settings, run.clock)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run)
+        self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
 
     def matrix(self) -> LightTransport:
         """The matrix of the last attempt, with its report."""
@@ -176,7 +177,7 @@ class _Attempts:
         parts = self._evaluated(first)
         transport, plan = matrix_of(problem, parts), self._proposals.plan
         with run.clock.phase("held_out"):
-            error = held_out_error(problem, transport, run.seed)
+            error = held_out_error(self._judged, transport, run.seed)
         _warn_if_missed(error, target, self._proposals.too_long)
         transport.report.update(
             _account(parts, problem, _skipped(problem.scene, self._dark))
@@ -217,7 +218,7 @@ class _Attempts:
             with self._run.clock.phase("held_out"):
                 transport = matrix_of(self._problem, attempts[-1])
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
-                found = held_out_error(self._problem, transport, stream, target).total
+                found = held_out_error(self._judged, transport, stream, target).total
             if found <= target or not proposals.after(found):
                 break
             if self._run.progress:
