@@ -25,7 +25,7 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
-from mi_sparse_prt.planner.choice import Predicted
+from mi_sparse_prt.planner.choice import TARGET, WORST_FACTOR, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.reflection.reflection import Diffuse
@@ -56,6 +56,7 @@ def precompute(
     measurement: Measurement | None = None,
     terms: int = 0,
     harmonics: int | None = None,
+    max_seconds: float = 300.0,
 ) -> LightTransport:
     """Compute the light transport matrix of a scene.
 
@@ -109,6 +110,9 @@ def precompute(
     harmonics : int, optional
         Spherical harmonics up to this order instead of each BRDF's own incident factors: (order + 1)^2 terms, which
         serve any BRDF (``LightTransport.with_bsdf``).
+    max_seconds : float
+        ``"auto"`` begins nothing that is predicted to take longer in all: of the plans within it the one that suits
+        the target error best is carried out, and a warning says what more time would buy.
 
     Returns
     -------
@@ -122,7 +126,8 @@ def precompute(
     Raises
     ------
     PrtError
-        If an argument makes no sense, or the matrix or what a method needs for it would not fit into memory.
+        If an argument makes no sense, the matrix or what a method needs for it would not fit into memory, or every
+        plan of ``"auto"`` is predicted to take longer than ``max_seconds``.
     """
     where = mesh_vertices(scene) if measurement is None else _of_scene(measurement, scene)
     folder = Path(checkpoint_folder) if checkpoint_folder else None
@@ -142,6 +147,7 @@ def precompute(
         terms,
         harmonics,
         where.kind,
+        max_seconds,
     )
     reset_peak_memory()
     if not isinstance(lighting, CubemapLighting):
@@ -163,11 +169,14 @@ class _Attempts:
         self._dark = _no_indirect(direct.problem, settings, run.clock)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run)
+        self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
 
     def matrix(self) -> LightTransport:
         """The matrix of the last attempt, with its report."""
-        run, problem, target = self._run, self._problem, self._settings.target_error
+        run, problem = self._run, self._problem
         expected = self._forecast()
+        if self._settings.method == "auto":
+            _check_time(expected, self._settings.max_seconds)
         first = self._direct_light()
         if first:
             expected = self._forecast()
@@ -176,8 +185,8 @@ class _Attempts:
         parts = self._evaluated(first)
         transport, plan = matrix_of(problem, parts), self._proposals.plan
         with run.clock.phase("held_out"):
-            error = held_out_error(problem, transport, run.seed)
-        _warn_if_missed(error, target, self._proposals.too_long)
+            error = held_out_error(self._judged, transport, run.seed)
+        _warn_if_missed(error, self._settings, self._proposals.too_long)
         transport.report.update(
             _account(parts, problem, _skipped(problem.scene, self._dark))
             | {"estimated_error": error.report(), "plans": self._proposals.report()}
@@ -217,7 +226,7 @@ class _Attempts:
             with self._run.clock.phase("held_out"):
                 transport = matrix_of(self._problem, attempts[-1])
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
-                found = held_out_error(self._problem, transport, stream, target).total
+                found = held_out_error(self._judged, transport, stream, target).total
             if found <= target or not proposals.after(found):
                 break
             if self._run.progress:
@@ -329,18 +338,33 @@ def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
     )
 
 
-def _warn_if_missed(error: HeldOutError, target: float | None, too_long: Predicted | None) -> None:
+def _check_time(expected: Forecast, max_seconds: float) -> None:
+    if expected.seconds > max_seconds:
+        raise PrtError(
+            f"the matrix would take about {expected.seconds:.0f} s, more than max_seconds={max_seconds:g}: allow more, "
+            "or use fewer texels (resolution) or vertices (edge_length)"
+        )
+
+
+def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted | None) -> None:
+    """Say that an error is above the target; or, where ``"auto"`` aimed at 2% unasked, that it is far above."""
+    target, asked = settings.target_error, settings.target_error is not None
+    if settings.method == "auto" and target is None and not settings.view_dependent:
+        target = WORST_FACTOR * TARGET
     if target is None or error.total - 2 * error.standard_error["total"] <= target:
         return
     more = ""
     if too_long is not None:
         method = {"paths": "brute_force"}.get(too_long.plan.indirect, too_long.plan.indirect)
-        more = f'; method="{method}" would meet it in about {too_long.seconds / 60:.0f} min'
-    warnings.warn(
-        f"the target error {target:g} was not met: the estimate is {error.total:.3g}{more}",
-        PrtWarning,
-        stacklevel=4,
+        seconds = too_long.seconds
+        time = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+        more = f'; method="{method}" would meet it in about {time}'
+        if settings.method == "auto" and seconds > settings.max_seconds:
+            more += f", max_seconds={settings.max_seconds:g} rules it out"
+    missed = (
+        f"the target error {target:g} was not met" if asked else "no target error was given, 2% was aimed at"
     )
+    warnings.warn(f"{missed}: the estimate is {error.total:.3g}{more}", PrtWarning, stacklevel=4)
 
 
 def _expectation(problem: Problem, expected: Forecast) -> str:

@@ -65,6 +65,10 @@ TargetError = Annotated[
         show_default="auto: 0.02, and one try",
     ),
 ]
+MaxSeconds = Annotated[
+    float,
+    typer.Option(metavar="SECONDS", help="auto begins nothing that is predicted to take longer in all."),
+]
 Terms = Annotated[
     int | None,
     typer.Option(
@@ -100,6 +104,7 @@ def precompute(
     spp: Samples = None,
     indirect_resolution: IndirectResolution = None,
     target_error: TargetError = None,
+    max_seconds: MaxSeconds = 300.0,
     terms: Terms = None,
     explain: Explain = False,
     strata: Strata = 2,
@@ -141,6 +146,7 @@ def precompute(
                 strata=strata,
                 checkpoint_folder=checkpoint,
                 terms=terms or 0,
+                max_seconds=max_seconds,
             )
         # what `relight` needs to load the same scene again
         transport.report["scene"] |= {

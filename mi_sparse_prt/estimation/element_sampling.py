@@ -130,7 +130,7 @@ def for_indirect_light(
     Parameters
     ----------
     transport : LightTransport
-        With indirect light.
+        If it has no indirect light, elements are drawn evenly.
     inside : slice
         The vertices of the mesh.
     rng : numpy.random.Generator
@@ -138,13 +138,14 @@ def for_indirect_light(
     part : float
         Of these elements.
     """
-    indirect = transport.operators["indirect"]
+    indirect = transport.operators.get("indirect")
     total = (inside.stop - inside.start) * transport.lighting.n_directions
     count = effort.paths_of(total, len(transport.meshes), part)
     pool = np.sort(rng.choice(total, min(total, POOL * count), replace=False))
     vertices, texels = np.divmod(pool, transport.lighting.n_directions)
     vertices += inside.start
-    light = np.abs(transport.albedo[vertices] * indirect.elements(vertices, texels)).sum(axis=1)
+    found = indirect.elements(vertices, texels) if indirect else np.ones((len(pool), 1), np.float32)
+    light = np.abs(transport.albedo[vertices] * found).sum(axis=1)
     mean = float(light.mean(dtype=np.float64))
     density = EVEN + (1 - EVEN) * (light / mean if mean > 0 else np.ones(len(pool)))
     probability = np.minimum(1.0, count / len(pool) * density.astype(np.float64))

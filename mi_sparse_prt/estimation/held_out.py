@@ -98,7 +98,7 @@ def held_out_error(
     Parameters
     ----------
     problem : Problem
-        Where the matrix has no indirect light, none is expected.
+        A matrix without indirect light is judged by what it lacks, unless ``max_depth`` is 2.
     transport : LightTransport
         Rows in the order of the scene's vertices.
     seed : int or SeedSequence
@@ -168,7 +168,7 @@ class _Estimator:
         for mesh in self._transport.meshes:
             lit = for_direct_light(self._transport, normals, mesh.vertices, rng, self._effort, part)
             samples[mesh.name, "direct"] = self.direct(lit)
-            if self._indirect is not None:
+            if self._problem.max_depth != 2:
                 seen = for_indirect_light(self._transport, mesh.vertices, rng, self._effort, part)
                 samples[mesh.name, "indirect"] = self.indirect(seen)
         return samples
@@ -181,7 +181,6 @@ class _Estimator:
 
     def indirect(self, chosen: Chosen) -> Sample:
         """What indirect light adds to both: its square and twice its product with direct light."""
-        assert self._indirect is not None
         first, second, variance = self._true_indirect(chosen)
         direct = np.mean(self._halves(chosen), axis=0)
         ours, direct_error = self._ours(self._indirect, chosen), self._ours(self._direct, chosen) - direct
@@ -241,8 +240,10 @@ class _Estimator:
         is_glossy = len(glossy) and len(chosen.vertices) and np.isin(chosen.vertices[0], glossy)
         return 1 + self._problem.reflection.terms if is_glossy else 1
 
-    def _ours(self, operator: Operator, chosen: Chosen) -> Doubles:
-        """Elements (m, rows, channels) of the matrix."""
+    def _ours(self, operator: Operator | None, chosen: Chosen) -> Doubles:
+        """Elements (m, rows, channels) of a part of the matrix, zero if it is left out."""
+        if operator is None:
+            return np.zeros((len(chosen.vertices), self._rows_per_point(chosen), 1))
         rows = self._problem.reflection.rows_of_each(chosen.vertices, self._rows_per_point(chosen))
         texels = np.repeat(chosen.texels, rows.shape[1])
         found = operator.elements(rows.ravel(), texels)

@@ -6,6 +6,7 @@ a temporary name beside the target and renamed when complete. Arrays that are th
 
 from __future__ import annotations
 
+import asyncio
 import zipfile
 import zlib
 from pathlib import Path
@@ -72,10 +73,19 @@ def read_store(path: Path) -> tuple[dict[str, Any], Arrays]:
     try:
         attributes: dict[str, Any] = dict(group.attrs)
         arrays = {name: _read(array) for name, array in group.arrays()}
+    except DAMAGE:
+        zarr.core.sync.sync(_let_others_end())
+        raise
     finally:
         store.close()
     same: dict[str, str] = attributes.pop("same", {})
     return attributes, arrays | {name: arrays[other] for name, other in same.items()}
+
+
+async def _let_others_end() -> None:
+    """Wait for chunks that Zarr still reads when one is damaged; else Python complains of them when it exits."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    await asyncio.gather(*others, return_exceptions=True)
 
 
 def _write(path: Path, attributes: dict[str, Any], arrays: Arrays) -> None:

@@ -35,6 +35,7 @@ class Settings:
     terms: int = 0
     harmonics: int | None = None
     measurement: str = "vertices"
+    max_seconds: float = 300.0
 
     def __post_init__(self) -> None:
         if isinstance(self.method, str) and self.method not in METHODS:
@@ -57,6 +58,8 @@ class Settings:
             raise PrtError(f"max_depth is {self.max_depth}; 2 is direct light only, -1 is no limit")
         if self.target_error is not None and not self.target_error > 0:
             raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
+        if not self.max_seconds > 0:
+            raise PrtError(f"max_seconds is {self.max_seconds}; it must be positive, 300 for five minutes")
         self._check_terms()
         if self.measurement != "vertices" and (self.view_dependent or self._needs_vertices):
             raise PrtError(

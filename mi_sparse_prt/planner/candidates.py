@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -73,22 +74,33 @@ class CandidatePlans:
     ----------
     too_long : Predicted or None
         A plan that would meet the target after all, and would take very long.
+
+    Notes
+    -----
+    Of ``"auto"``, plans that are predicted to take longer than ``max_seconds`` are not carried out; if all do, the
+    quickest one is the present one.
     """
 
     too_long: Predicted | None = None
 
     def __init__(self, costs: Costs, settings: Settings) -> None:
         self._settings = settings
+        self._limit = settings.max_seconds if settings.method == "auto" else math.inf
         self._rank(costs)
 
     def _rank(self, costs: Costs) -> None:
-        settings = self._settings
+        settings, target = self._settings, self._settings.target_error
         self._costs = costs
-        self._plans = predictions(costs, settings.target_error or TARGET, settings.spp)
+        self._plans = predictions(costs, target or TARGET, settings.spp)
         # errors of paths are predicted too well for a first attempt to turn out better
         begin = choose_first if settings.method == "auto" else choose
-        self._best = begin(self._plans, settings.target_error)
+        within = [p for p in self._plans if p.seconds <= self._limit] or self._plans[:1]
+        self._best = begin(within, target)
         self._tried = [self._best]
+        if len(within) < len(self._plans):
+            wished = choose(self._plans, target or TARGET)
+            good_enough = min(p.error for p in within) <= (target or TARGET)
+            self.too_long = None if good_enough or wished.error > (target or TARGET) else wished
 
     @property
     def plan(self) -> Plan:
@@ -122,7 +134,7 @@ class CandidatePlans:
             return False
         plans = finer(self._costs, self._best, error, target, settings.spp)
         self._costs = learned(self._costs, self._best.plan, error)
-        budget = TIME_BUDGET * self._tried[0].seconds
+        budget = min(TIME_BUDGET * self._tried[0].seconds, self._limit - sum(p.seconds for p in self._tried))
         found = choose(plans, target) if plans else None
         if found is not None and found.seconds > budget:
             self.too_long = found if found.error <= target else None

@@ -55,6 +55,7 @@ class SparsePRT(mi.SamplingIntegrator):
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the matrix to aim at. (0: that of ``prt.precompute``)
+    max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               integer    Of in-out factors: BSDFs that are not diffuse are then shaded for the view, per
                                    pixel. (0: they count as diffuse)
@@ -79,6 +80,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "spp": props.get("precompute_spp") if "precompute_spp" in props else None,
             "indirect_resolution": props.get("indirect_resolution", coarse) or None,
             "target_error": props.get("target_error", 0.0) or None,
+            "max_seconds": props.get("max_seconds", 300.0),
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),
             "terms": props.get("terms", 0),

@@ -25,6 +25,9 @@ SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 #: BSDFs that bend the shading normal of the one that they wrap.
 BUMPED = {"NormalMap", "BumpMap"}
 
+#: Filters and wrap modes of bitmaps; what Mitsuba takes unless told otherwise comes first.
+_LOOKUPS = [(f, w) for f in ("Linear", "Nearest") for w in ("Repeat", "Mirror", "Clamp")]
+
 
 def bsdf_class(bsdf: mi.BSDF) -> str:
     """The class of a BSDF, also of one that is written in Python."""
@@ -149,14 +152,33 @@ class Material:
         return all(_has_equal_channels(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
-        """SHA-256 of the BSDF's text and of all parameters that `mi.traverse` shows, bitmaps included."""
+        """SHA-256 of the BSDF's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
         state = hashlib.sha256(self._text.encode())
         parameters = mi.traverse(self.bsdf)
         for name in sorted(parameters.keys()):
             value = parameters[name]
             state.update(name.encode())
             state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
+            texture = next((of for of in parameters.properties[name] if isinstance(of, mi.Texture)), None)
+            if name.endswith("data") and texture is not None and value.ndim == 3:
+                found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
+                state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
         return state.digest()
+
+
+def _lookup(texture: mi.Texture, data: mi.TensorXf, to_uv: mi.ScalarTransform3f) -> tuple[str, str]:
+    """Filter and wrap mode of a bitmap (h, w, channels), which it tells nobody: those that explain its values."""
+    uv = np.random.default_rng(0).uniform(-1, 2, (2, 256)).astype(np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, uv.shape[1])
+    si.uv, si.wi = mi.Point2f(uv), mi.Vector3f(0, 0, 1)
+    wanted = np.array(texture.eval(si))  # [channel, point]
+    inside = mi.Point2f((np.array(to_uv.matrix) @ np.vstack([uv, np.ones_like(uv[:1])]))[:2])
+    off = []
+    for filtering, wrapping in _LOOKUPS:
+        modes = getattr(dr.FilterMode, filtering), getattr(dr.WrapMode, wrapping)
+        values = np.array(mi.Texture2f(mi.TensorXf(data), True, False, *modes).eval(inside))
+        off.append(np.abs(values - wanted).max())
+    return _LOOKUPS[int(np.argmin(np.round(off, 3)))]  # 1e-3: bitmaps may be kept as half floats
 
 
 def _has_equal_channels(value: Any) -> bool:

@@ -14,6 +14,7 @@ from mi_sparse_prt.estimation import element_sampling, held_out
 from mi_sparse_prt.estimation.element_sampling import Effort, for_direct_light, for_indirect_light
 from mi_sparse_prt.estimation.held_out import Sample, relative
 from mi_sparse_prt.measurement.measurement import mesh_vertices
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -147,6 +148,20 @@ def test_the_estimate_covers_the_true_error(grey_scene, basis, coarse):
     assert deviations.max() < 5
     assert max(widths) < 0.25
     assert 0.9 < np.mean(ratios) < 1.1  # no bias of its own
+
+
+def test_indirect_light_that_is_left_out(grey_scene):
+    """Rationale: a plan may leave interreflections out. Its matrix lacks them, and must say so; it said 0 before."""
+    transport = prt.precompute(grey_scene, LIGHTING, method=Plan("exact"), seed=2, progress=False)
+    assert "indirect" not in transport.operators
+    true = errors_of(grey_scene, transport, converged(grey_scene, "direction"))
+    assert true["total"] > 0.1
+    assert transport.report["estimated_error"]["total"] == pytest.approx(true["total"], rel=0.25)
+    runs = [estimates(held_out_error(grey_scene, transport, 5, seed)) for seed in SEEDS]
+    for name, error in true.items():
+        found = np.mean([run[0][name] for run in runs])
+        spread = np.sqrt(np.mean([run[1][name] ** 2 for run in runs]) / len(runs))
+        assert abs(found - error) < 4 * spread < 0.2 * error
 
 
 def test_an_error_put_in_is_found(exact):

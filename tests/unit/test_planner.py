@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import warnings
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from conftest import GREY, build, diffuse, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
@@ -32,6 +34,7 @@ from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
+from mi_sparse_prt.precompute import _warn_if_missed
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
 
@@ -294,6 +297,68 @@ def test_short_of_what_takes_very_long_there_is_something_better():
     assert (ranking.plan.indirect, ranking.plan.rays) == ("gather", 256)
     assert ranking.too_long is not None and ranking.too_long.plan.indirect == "paths"
     assert not ranking.after(0.05)  # 2% of noise
+
+
+def test_no_plan_is_begun_that_takes_longer_than_asked():
+    """
+    Scenario: 1% by paths takes an hour, gathering ends at 20%.
+    Expected: of what fits into five minutes that with the least error, and the hour is spoken of; nothing is if it fits
+        or if it is asked for by name; nothing longer follows after a miss either.
+    """
+    paths = PathCosts({32: 1.0}, {32: 0.6}, {32: 0.0})
+    costs = Costs(0, EXACT, paths, BiasedGather(0.2))
+
+    def ranking(**given):
+        return CandidatePlans(costs, Settings(32, target_error=0.01, **given))
+
+    hour = ranking(max_seconds=1e5)
+    assert hour.plan.indirect == "paths" and hour.seconds > 3000 and hour.too_long is None
+    assert ranking(method="brute_force").plan == hour.plan
+    short = ranking()
+    assert short.seconds < 300 and short.too_long.plan == hour.plan
+    assert (
+        short.plan
+        == min((p for p in predictions(costs, 0.01) if p.seconds <= 300), key=lambda p: p.error).plan
+    )
+    while short.after(0.2):
+        assert short.seconds < 300
+    assert all(p.seconds < 300 for p in short._tried)
+    assert sum(p.seconds for p in short._tried) <= 300
+    assert CandidatePlans(costs, Settings(32, target_error=0.05)).too_long is None
+
+
+def test_what_fits_into_no_time_is_refused_before_it_is_begun(grey_scene):
+    with pytest.raises(
+        prt.PrtError, match=r"would take about \d+ s, more than max_seconds=0.001: allow more"
+    ):
+        prt.precompute(grey_scene, LIGHTING, max_seconds=1e-3, progress=False)
+    with pytest.raises(prt.PrtError, match="max_seconds is 0; it must be positive"):
+        prt.precompute(grey_scene, LIGHTING, max_seconds=0, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("error", "given", "said"),
+    [
+        (0.03, {}, None),
+        (0.08, {}, r"no target error was given, 2% was aimed at: the estimate is 0.08"),
+        (
+            0.03,
+            {"target_error": 0.01},
+            r"the target error 0.01 was not met: the estimate is 0.03; .* about 60 min",
+        ),
+        (0.08, {"method": "gather"}, None),
+    ],
+)
+def test_a_matrix_far_from_what_was_aimed_at_is_told(error, given, said):
+    found = HeldOutError(error, {}, {"total": 0.1 * error}, 100, [])
+    hour = Predicted(Plan("exact", "paths", resolution=32, spp=9), 3600.0, 0.01)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _warn_if_missed(found, Settings(32, **given), hour)
+    assert len(caught) == (said is not None)
+    if said:
+        assert re.search(said, str(caught[0].message))
+        assert "max_seconds=300 rules it out" in str(caught[0].message)
 
 
 def test_a_report_is_json():

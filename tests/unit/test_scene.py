@@ -1,5 +1,6 @@
 """Loading: vertices, normals, albedo, the unit-box copy, hashes, and what is refused."""
 
+import itertools
 import runpy
 import warnings
 from pathlib import Path
@@ -525,6 +526,33 @@ def test_hash_sees_a_bsdf_parameter_that_no_vertex_shows() -> None:
             ).hash
 
     assert key(0.1) == key(0.1) != key(0.11)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_hash_sees_how_bitmaps_are_looked_up(channels: int) -> None:
+    """Rationale: filter and wrap mode are no parameters, and vertices may fall where they make no difference.
+
+    Expected: six hashes for six ways, of opacity as well; the usual way is Mitsuba's own, so that files of scenes with
+        bitmaps are still theirs.
+    """
+    texels = np.random.default_rng(0).random((5, 7, channels)).astype(np.float32)
+
+    def key(**modes: str) -> str:
+        texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(texels), **modes}
+        place = mi.ScalarTransform4f().scale([2, 3, 1])
+        texture["to_uv"] = place
+        bsdf = {"type": "diffuse", "reflectance": texture}
+        if channels == 1:
+            bsdf = {"type": "mask", "opacity": texture, "nested": diffuse(0.5, 0.5, 0.5)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PrtWarning)
+            shape = {"type": "rectangle", "bsdf": bsdf}
+            return Scene.from_mitsuba(mi.load_dict({"type": "scene", "s": shape}), INF).hash
+
+    ways = itertools.product(("bilinear", "nearest"), ("repeat", "mirror", "clamp"))
+    hashes = [key(filter_type=kind, wrap_mode=mode) for kind, mode in ways]
+    assert len(set(hashes)) == 6
+    assert hashes[0] == key()
 
 
 # ------------------------------------------------------------------------------------- hygiene and errors

@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -414,3 +416,22 @@ def test_wavelet_coefficients_that_make_no_sense(tmp_path, what):
     damaged = replace(direct, starts=starts, places=places, values=values, scales=scales)
     replace(transport, operators={"compressed": damaged}).save(tmp_path / "a.prt")
     refused(tmp_path / "a.prt")
+
+
+def test_one_line_of_error_is_all_that_is_said(tmp_path):
+    """Rationale: chunks are read beside each other; those in flight when one was found damaged made Python complain
+    of destroyed tasks as it ended.
+    """
+    path = tmp_path / "a.prt"
+    store.write_store(path, {}, {"values": np.random.default_rng(0).random((200_000, 20), np.float32)})
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    code = (
+        "import sys; from pathlib import Path; from mi_sparse_prt.io.store import DAMAGE, read_store\n"
+        "try: read_store(Path(sys.argv[1]))\n"
+        "except DAMAGE as error: print(error)"
+    )
+    found = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    assert "Bad CRC-32" in found.stdout
+    assert found.stderr == ""
