@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.transport import LightTransport
 
 FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
@@ -59,14 +60,20 @@ class Effort:
     spp: int = 512
     strata: int = 4
 
-    def rays_of(self, total: int) -> float:
-        """How many elements of so many are drawn for direct light that is bits, about."""
-        return max(self.rays * total, min(total / 4, self.fewest_rays))
+    def rays_of(self, total: int, n_meshes: int) -> float:
+        """How many elements of a mesh, one of ``n_meshes``, are drawn for direct light that is bits, about."""
+        return max(self.rays * total, min(total / 4, self.fewest_rays * _share(n_meshes)))
 
     def paths_of(self, total: int, n_meshes: int, part: float = 1.0) -> int:
         """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""
-        share = max(self.paths // n_meshes, self.few_paths)
-        return max(round(part * min(share, total // 16)), min(self.fewest_paths, total))
+        share = max(self.paths // n_meshes, round(self.few_paths * _share(n_meshes)))
+        fewest = max(round(self.fewest_paths * _share(n_meshes)), 1)
+        return max(round(part * min(share, total // 16)), min(fewest, total))
+
+
+def _share(n_meshes: int) -> float:
+    """Of the least number of elements, where meshes are many: cost follows vertices, not shapes."""
+    return min(1.0, FEW_MESHES / n_meshes)
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,8 @@ def for_direct_light(
         Of these elements.
     """
     lighting, direct = transport.lighting, transport.operators["direct"]
-    rays = part * effort.rays_of((inside.stop - inside.start) * lighting.n_directions)
+    total = (inside.stop - inside.start) * lighting.n_directions
+    rays = part * effort.rays_of(total, len(transport.meshes))
     floor, edges = 0.0, _NO_EDGES
     if not direct.dark_below_horizon:
         rays, floor = rays / FEW, BELOW_HORIZON

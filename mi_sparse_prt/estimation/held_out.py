@@ -12,16 +12,23 @@ mean, (S - m)^2 - v estimates (S - s)^2.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
-from mi_sparse_prt.estimation.element_sampling import Chosen, Effort, for_direct_light, for_indirect_light
+from mi_sparse_prt.estimation.element_sampling import (
+    Chosen,
+    Effort,
+    for_direct_light,
+    for_indirect_light,
+)
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
@@ -32,6 +39,7 @@ Doubles = NDArray[np.float64]
 
 ROUNDING = 1e-5  # relative errors below are those of float32
 HELD_OUT = 1  # spawn key
+BATCH = 1 << 20  # elements, evaluated together
 ROUND = 0.25  # of the elements: these mostly tell whether a target is met
 
 
@@ -53,6 +61,7 @@ class Sample:
     norms: NDArray[np.float64]
 
 
+Record = TypeVar("Record", Sample, Chosen)
 Samples = dict[tuple[str, str], Sample]  # by the names of a mesh and of a part
 
 
@@ -123,19 +132,20 @@ def held_out_error(
 
 def _together(first: Samples, second: Samples) -> Samples:
     """Samples of which each stands for its mesh as one; weights matter relative to each other only."""
-    return {
-        key: Sample(*(np.concatenate(pair) for pair in zip(astuple(first[key]), astuple(more), strict=True)))
-        if key in first
-        else more
-        for key, more in second.items()
-    }
+    return {key: _joined([first[key], more]) if key in first else more for key, more in second.items()}
+
+
+def _joined(records: list[Record]) -> Record:
+    """One record of the elements of several."""
+    parts = zip(*(vars(record).values() for record in records), strict=True)
+    return type(records[0])(*map(np.concatenate, parts))
 
 
 def estimate_errors(samples: Samples) -> HeldOutError:
     """Relative L2 errors and standard errors."""
     names = dict.fromkeys(name for name, _ in samples)
     meshes = {name: relative([sample for (of, _), sample in samples.items() if of == name]) for name in names}
-    total = relative(list(samples.values()))
+    total = relative(_pooled(samples))
     rows = max(sample.squares.shape[1] for sample in samples.values())
     glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
     return HeldOutError(
@@ -145,6 +155,16 @@ def estimate_errors(samples: Samples) -> HeldOutError:
         sum(len(sample.weights) for sample in samples.values()),
         [relative(glossy, row)[0] for row in range(2, rows)],
     )
+
+
+def _pooled(samples: Samples) -> list[Sample]:
+    """Those of all meshes; of many in as few samples as can be: something is added to the spread of each."""
+    if len({name for name, _ in samples}) <= FEW_MESHES:
+        return list(samples.values())
+    kinds: dict[tuple[str, int], list[Sample]] = {}
+    for (_, part), sample in samples.items():
+        kinds.setdefault((part, sample.squares.shape[1]), []).append(sample)
+    return [_joined(some) for some in kinds.values()]
 
 
 class _Estimator:
@@ -163,15 +183,33 @@ class _Estimator:
             self._term_paths = TermPaths(problem, effort.spp // 2, self._seeds[2])
 
     def samples(self, rng: np.random.Generator, part: float) -> Samples:
-        """Elements of each mesh, for direct and for indirect light."""
-        samples, normals = {}, self._problem.points.normals
+        """Elements of each mesh, for direct and for indirect light; drawn by mesh, evaluated together."""
+        chosen, normals = {}, self._problem.points.normals
         for mesh in self._transport.meshes:
-            lit = for_direct_light(self._transport, normals, mesh.vertices, rng, self._effort, part)
-            samples[mesh.name, "direct"] = self.direct(lit)
+            place = mesh.vertices, rng, self._effort, part
+            chosen[mesh.name, "direct"] = for_direct_light(self._transport, normals, *place)
             if self._problem.max_depth != 2:
-                seen = for_indirect_light(self._transport, mesh.vertices, rng, self._effort, part)
-                samples[mesh.name, "indirect"] = self.indirect(seen)
-        return samples
+                chosen[mesh.name, "indirect"] = for_indirect_light(self._transport, *place)
+        found: Samples = {}
+        for keys in self._batches(chosen):
+            some = [chosen[key] for key in keys]
+            whole = (self.direct if keys[0][1] == "direct" else self.indirect)(_joined(some))
+            ends = np.cumsum([len(each.weights) for each in some])[:-1]
+            parts = zip(*(np.split(part, ends) for part in vars(whole).values()), strict=True)
+            found |= {key: Sample(*part) for key, part in zip(keys, parts, strict=True)}
+        return {key: found[key] for key in chosen}
+
+    def _batches(self, chosen: dict[tuple[str, str], Chosen]) -> Iterator[list[tuple[str, str]]]:
+        """Those to evaluate together: of one part, with as many rows per point, and not too many."""
+        begun: dict[tuple[str, int], list[tuple[str, str]]] = {}
+        for key, some in chosen.items():
+            kind = key[1], self._rows_per_point(some)
+            batch = begun.setdefault(kind, [])
+            if batch and sum(len(chosen[k].weights) for k in [*batch, key]) > BATCH:
+                yield begun.pop(kind)
+                batch = begun.setdefault(kind, [])
+            batch.append(key)
+        yield from begun.values()
 
     def direct(self, chosen: Chosen) -> Sample:
         """Squared errors and norms of direct light alone."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
@@ -55,11 +56,10 @@ class PilotElements:
     seed : int or SeedSequence
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     vertices_per_mesh, texels_per_vertex : int
+        Of many meshes, as many vertices as of ``FEW_MESHES``, drawn from all together.
 
     Attributes
     ----------
-    sizes : (n_meshes,) integers
-        Vertices of each mesh.
     vertices : (k,) integers
         Sorted; of all meshes.
     stand_for : (k,) float64
@@ -87,14 +87,16 @@ class PilotElements:
         )
         stream = random_stream(seed, PILOT)
         self._seeds, rng = element_seeds(stream, 4), np.random.default_rng(stream)
-        self.sizes = np.array([m.vertices.stop - m.vertices.start for m in scene.meshes])
+        strata = scene.sampled_together
+        most = vertices_per_mesh * (FEW_MESHES if len(strata) < len(scene.meshes) else 1)
+        sizes = [part.stop - part.start for part in strata]
         chosen = [
-            mesh.vertices.start + np.sort(rng.choice(size, min(size, vertices_per_mesh), replace=False))
-            for mesh, size in zip(scene.meshes, self.sizes, strict=True)
+            part.start + np.sort(rng.choice(size, min(size, most), replace=False))
+            for part, size in zip(strata, sizes, strict=True)
         ]
         counts = [len(ids) for ids in chosen]
         self.vertices = np.concatenate(chosen)
-        self.stand_for = np.repeat(self.sizes / counts, counts)
+        self.stand_for = np.repeat(np.divide(sizes, counts), counts)
         n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
         self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
         self._albedo = scene.albedo[self.vertices][:, None].astype(np.float64)  # [vertex, 1, rgb]

@@ -13,6 +13,7 @@ from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.methods.half_floats import overflows
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -52,7 +53,7 @@ def path_traced(solver: PathSolver, lighting: CubemapLighting, run: Run) -> Upsa
         density, checkpoint = np.zeros(shape, dtype=np.float16), run.checkpoint()
         kept = Checkpoint(checkpoint, density) if checkpoint else None
         bar = run.bar(len(density), "indirect", done=kept.rows_done if kept else 0)
-        _trace(solver, density, lambda ids: solver.rows(ids).mean, bar, kept)
+        density = _trace(solver, density, lambda ids: solver.rows(ids).mean, bar, kept)
     return Upsampled(density, lighting.upsampling(solver.lighting), lighting)
 
 
@@ -68,14 +69,21 @@ def _trace(
     rows: Callable[[NDArray[np.uint32]], NDArray[Any]],
     bar: tqdm,
     kept: Checkpoint | None = None,
-) -> None:
-    """Fill an array with all rows of a solver, one wavefront at a time."""
+) -> NDArray[Any]:
+    """Fill an array with all rows of a solver, one wavefront at a time; half floats become wider if they overflow."""
     with bar:
         for a in range(kept.rows_done if kept else 0, len(stored), solver.block_size):
             ids = np.arange(a, min(a + solver.block_size, len(stored)), dtype=np.uint32)
-            stored[a : a + len(ids)] = rows(ids)
+            found = rows(ids)
+            if stored.dtype == np.float16 and overflows(found):
+                stored = stored.astype(np.float32)
+                if kept:  # its rows are half floats; the rest is not kept
+                    kept.remove()
+                    kept = None
+            stored[a : a + len(ids)] = found
             if kept:
                 kept.append(stored[a : a + len(ids)])
             bar.update(len(ids))
     if kept:
         kept.remove()
+    return stored

@@ -33,8 +33,7 @@ def by_consensus(direct: DirectSolver, run: Run) -> Consensus:
                 return direct.visible(vertices, texels)
 
         state = Consensus(scene.normals, AngularGrid(direct.lighting), trace)
-        for mesh in scene.meshes:
-            at = mesh.vertices
+        for at in scene.sampled_together:
             positions, normals = scene.normalised_positions[at], scene.normals[at]
             sample_by_levels(state, Surface(at.start, positions, normals, keys[at]))
     return state

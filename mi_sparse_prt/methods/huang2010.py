@@ -21,6 +21,7 @@ from mi_sparse_prt.core.profiling import Stopwatch
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.measurement.neighbours import radius_neighbours
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler, indirect_of
+from mi_sparse_prt.methods.half_floats import halved
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.upsampled import Upsampled
@@ -103,7 +104,7 @@ def huang2010_parts(
     if indirect is not None:
         with run.clock.phase("dense_paths"):
             rows, kept = indirect_of(indirect, dense.ids, grid.texels, run)
-            interreflected = Upsampled(rows.mean.astype(np.float16), grid.upsampling, direct.lighting)
+            interreflected = Upsampled(halved(rows.mean), grid.upsampling, direct.lighting)
     with run.clock.phase("system"):
         stacked, mean = whole_rows(visibility, interreflected)
     weights, evaluated, sparse = _fitted(direct, indirect, dense, stacked, mean, run, options)

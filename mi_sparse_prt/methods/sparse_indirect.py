@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from mi_sparse_prt.io.checkpoint import Checkpoint
 from mi_sparse_prt.measurement.neighbours import Neighbours
 from mi_sparse_prt.methods.dense_neighbourhoods import Neighbourhood
 from mi_sparse_prt.methods.dense_sampling import Dense, indirect_of
+from mi_sparse_prt.methods.half_floats import halved
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.reconstruction.denoising import DenoisedRows, denoise_rows, smooth_rows
@@ -101,8 +101,7 @@ def indirect_part(
     weights = scipy.sparse.csr_array(entries, shape=(len(scene.positions), len(dense.ids)))
     for file in kept:
         file.remove()
-    half = mi.Float16(mi.Float(density.ravel())).numpy().reshape(density.shape)  # ten times as fast as NumPy
-    factor = Upsampled(half, grid.upsampling, solver.lighting)
+    factor = Upsampled(halved(density), grid.upsampling, solver.lighting)
     return Interpolated(factor, weights), len(dense.ids) * len(grid.texels) + fit.elements
 
 

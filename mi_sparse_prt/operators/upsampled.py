@@ -22,7 +22,7 @@ class Upsampled(Operator):
     Attributes
     ----------
     density : (n, n_coarse, channels) float16, 1/sr
-        channels is 1 in a grey scene.
+        channels is 1 in a grey scene. float32 where light is focused so much that float16 overflows.
     upsampling : (n_directions, n_coarse) sparse, rows sum to 1
         Interpolates a coarse cubemap at the lighting's directions; the identity where none is coarser.
     lighting : CubemapLighting

@@ -102,15 +102,15 @@ def _patches(
     how many vertices of the scene each of them stands for.
     """
     patches, inner, stands_for, first = [], [], [], 0
-    for mesh in scene.meshes:
-        p = scene.normalised_positions[mesh.vertices]
+    for part in scene.sampled_together:
+        p = scene.normalised_positions[part]
         centres = p[rng.choice(len(p), max(1, round(PATCHES * len(p) / scene.n_vertices)), replace=False)]
         tree = cKDTree(p)
         patch, core = (
             np.unique(tree.query(centres, min(count, len(p)))[1])
             for count in (PATCH, PATCH // INNER if len(p) > PATCH else PATCH)
         )
-        patches.append(mesh.vertices.start + patch)
+        patches.append(part.start + patch)
         inner.append(first + np.searchsorted(patch, core))
         stands_for.append(np.full(len(core), len(p) / len(core)))
         first += len(patch)

@@ -85,9 +85,10 @@ def _too_dear(costs: Costs, settings: Settings, path: float, noise: float) -> bo
 
 def _check(held: PilotElements) -> float:
     """Seconds of a check by held-out elements."""
-    totals = [int(size) * held.lighting.n_directions for size in held.sizes]
+    meshes = held.problem.scene.meshes
+    totals = [(mesh.vertices.stop - mesh.vertices.start) * held.lighting.n_directions for mesh in meshes]
     effort = Effort()
-    drawn = DRAWN * sum(effort.rays_of(total) for total in totals)
+    drawn = DRAWN * sum(effort.rays_of(total, len(totals)) for total in totals)
     if held.indirect is None:
         return drawn
     paths = sum(effort.paths_of(total, len(totals)) for total in totals)

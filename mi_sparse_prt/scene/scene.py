@@ -25,6 +25,8 @@ from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, triangle_keys
 
+FEW_MESHES = 12  # more are sampled together: what each took would grow with shapes, not with vertices
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -178,6 +180,13 @@ class Scene:
     def n_vertices(self) -> int:
         """The number of vertices, which is the number of rows of the matrix."""
         return len(self.positions)
+
+    @property
+    def sampled_together(self) -> list[slice]:
+        """Vertices that are strata or surfaces of their own: those of each mesh, or all where meshes are many."""
+        if len(self.meshes) > FEW_MESHES:
+            return [slice(0, self.n_vertices)]
+        return [mesh.vertices for mesh in self.meshes]
 
     @cached_property
     def vertex_areas(self) -> NDArray[np.float32]:

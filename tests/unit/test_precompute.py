@@ -193,7 +193,9 @@ def test_an_interrupted_run_goes_on_to_the_same_matrix(grey_scene, monkeypatch, 
         with pytest.raises(KeyboardInterrupt):
             precompute(grey_scene, checkpoint_folder=tmp_path)
     (kept,) = tmp_path.iterdir()
-    assert kept.stat().st_size == 3 * 42 * 96 * 2  # three blocks of half floats
+    assert kept.stat().st_size == 3 * (
+        42 * 96 * 2 + 20
+    )  # three blocks of half floats, each with place and checksum
 
     monkeypatch.setattr(PathSolver, "rows", lambda self, ids: (calls.append(ids), rows(self, ids))[1])
     calls.clear()

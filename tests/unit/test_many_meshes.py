@@ -1,0 +1,114 @@
+"""Scenes of more than a dozen meshes: what a mesh gets at least is shared, and cost follows vertices, not shapes."""
+
+import numpy as np
+import pytest
+from conftest import T, build, diffuse
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.estimation.element_sampling import Effort
+from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.measurement.measurement import mesh_vertices
+from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.reflection.reflection import Diffuse
+from mi_sparse_prt.scene.scene import FEW_MESHES
+from mi_sparse_prt.solvers.problem import Problem, diffuse_problem
+
+LIGHTING = prt.CubemapLighting(4)
+SEEDS = range(6)
+
+
+def crowd(count: int, order: int = 0, edge_length: float = 0.4) -> prt.Scene:
+    """Boxes of several greys, turned and of different height, on a ground."""
+    rng = np.random.default_rng(1)
+    side = int(np.ceil(np.sqrt(count)))
+    shapes = {
+        "ground": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90).scale(0.5 * side),
+            "bsdf": diffuse(0.5, 0.5, 0.5),
+        }
+    }
+    for k in range(count):
+        height, angle, grey = 0.15 + 0.3 * rng.random(), 90 * rng.random(), 0.3 + 0.5 * rng.random()
+        place = T().translate([k // side - side / 2 + 0.5, height + 0.01, k % side - side / 2 + 0.5])
+        shapes[f"box{k}"] = {
+            "type": "cube",
+            "to_world": place.rotate([0, 1, 0], angle).scale([0.25, height, 0.25]),
+            "bsdf": diffuse(grey, grey, grey),
+        }
+    names = np.random.default_rng(order).permutation(list(shapes)) if order else list(shapes)
+    return build(edge_length, **{str(name): shapes[str(name)] for name in names})
+
+
+@pytest.fixture(scope="module")
+def scene() -> prt.Scene:
+    return crowd(16)
+
+
+@pytest.mark.parametrize("n_meshes", [13, 100, 1000])
+def test_what_is_held_out_follows_vertices(n_meshes):
+    """Expected: of many meshes hardly more elements than of one that has all their vertices; before, 40 times as many
+    rays and 25 times as many paths of 300 boxes.
+    """
+    effort, total = Effort(), 40_000 * 6144
+    whole = effort.rays_of(total, 1), effort.paths_of(total, 1)
+    parts = [kind(total // n_meshes, n_meshes) * n_meshes for kind in (effort.rays_of, effort.paths_of)]
+    assert parts[0] < FEW_MESHES / 7 * whole[0]
+    assert whole[1] / 2 < parts[1] < 1.2 * whole[1]
+
+
+def test_few_meshes_have_what_they_had():
+    assert all(Effort().rays_of(1 << 20, k) == 1 << 16 for k in range(1, FEW_MESHES + 1))
+    assert Effort().paths_of(1 << 20, FEW_MESHES) == 512
+
+
+def test_a_pilot_looks_at_a_few_hundred_vertices(scene):
+    held = PilotElements(diffuse_problem(scene, LIGHTING, max_depth=2), False, 0, 16, 4)
+    assert len(held.vertices) == 16 * FEW_MESHES
+    assert held.stand_for.sum() == pytest.approx(scene.n_vertices)
+
+
+def test_the_error_of_many_meshes(scene):
+    """Rationale: elements of all meshes are evaluated together, and told apart again.
+
+    Expected: the estimate of a rough matrix, in total and of the largest meshes, is that against brute force.
+    """
+    transport = prt.precompute(
+        scene, LIGHTING, Plan("consensus", "gather", 16, 0.2), max_depth=3, progress=False
+    )
+    truth = [
+        prt.precompute(scene, LIGHTING, "brute_force", max_depth=3, spp=128, seed=50 + k, progress=False)
+        .rows(np.arange(scene.n_vertices))
+        .astype(np.float64)
+        for k in (0, 1)
+    ]
+    ours = transport.rows(np.arange(scene.n_vertices)).astype(np.float64)
+
+    def true(rows: slice) -> float:
+        x, y = (t[rows] for t in truth)
+        return float(np.sqrt(((ours[rows] - x) * (ours[rows] - y)).sum() / (x * y).sum()))
+
+    problem = Problem(scene, LIGHTING, mesh_vertices(scene), Diffuse(scene.albedo), "direction", 3)
+    runs = [held_out_error(problem, transport, seed) for seed in SEEDS]
+    spread = np.sqrt(np.mean([run.standard_error["total"] ** 2 for run in runs]) / len(runs))
+    found = np.sqrt(np.mean([run.total**2 for run in runs]))
+    print(f"total {found:.4f} +- {spread:.4f}, true {true(slice(None)):.4f}")
+    assert abs(found - true(slice(None))) < 3 * spread < 0.2 * found
+    for mesh in scene.meshes[:4]:
+        found = np.sqrt(np.mean([run.meshes[mesh.name] ** 2 for run in runs]))
+        errors = [run.standard_error["meshes"][mesh.name] for run in runs]
+        assert abs(found - true(mesh.vertices)) < 4 * np.sqrt(np.mean(np.square(errors)) / len(runs)) + 2e-3
+
+
+def test_order_of_many_shapes():
+    """Expected: the same row for the same vertex, bit by bit, though all vertices are sampled as one surface."""
+    rows = []
+    for order in (1, 2):
+        scene = crowd(14, order)
+        assert len(scene.sampled_together) == 1
+        transport = prt.precompute(scene, LIGHTING, Plan("consensus"), max_depth=2, progress=False)
+        keys = scene.vertex_keys
+        assert len(np.unique(keys)) == len(keys)
+        rows.append(transport.rows(np.argsort(keys)))
+    assert np.array_equal(*rows)
