@@ -117,7 +117,7 @@ def precompute(
     Returns
     -------
     LightTransport
-        With ``report``: ``seconds`` per phase (``compile`` apart, see ``cost.Stopwatch``), ``elements_total``,
+        With ``report``: ``seconds`` per phase (``compile`` apart, see ``profiling.Stopwatch``), ``elements_total``,
         ``elements_evaluated``, ``rays``, ``estimated_error``, ``skipped``, ``forecast`` (``seconds``, ``bytes``),
         ``plan`` (what was carried out: ``direct``, ``indirect``, ``parameters``), ``plans`` (of ``"auto"``: the same
         and ``predicted_seconds``, ``predicted_error`` and ``chosen`` of each), ``peak_memory_bytes``, ``seed``,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
+from threading import get_ident
 
 import drjit as dr
 import mitsuba as mi
@@ -81,19 +82,23 @@ class Stopwatch:
 class _Compiler(Listener):
     """Makes a phase of every stretch of time in which numba compiles, or loads what it compiled before.
 
-    Its lock is what both have in common; the event named after compilation leaves loading out.
+    Its lock is what both have in common; the event named after compilation leaves loading out. What other threads
+    compile meanwhile stays in the phase: phases are those of one thread, and the events of two interleave.
     """
 
     def __init__(self, clock: Stopwatch) -> None:
-        self._clock = clock
+        self._clock, self._thread = clock, get_ident()
         self._phases: list[AbstractContextManager[None]] = []  # the lock may be taken again by whoever has it
 
     def on_start(self, event: Event) -> None:
+        if get_ident() != self._thread:
+            return
         self._phases.append(self._clock.phase("compile"))
         self._phases[-1].__enter__()
 
     def on_end(self, event: Event) -> None:
-        self._phases.pop().__exit__(None, None, None)
+        if get_ident() == self._thread:
+            self._phases.pop().__exit__(None, None, None)
 
 
 def reset_peak_memory() -> None:

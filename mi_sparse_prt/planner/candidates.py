@@ -97,10 +97,8 @@ class CandidatePlans:
         within = [p for p in self._plans if p.seconds <= self._limit] or self._plans[:1]
         self._best = begin(within, target)
         self._tried = [self._best]
-        if len(within) < len(self._plans):
-            wished = choose(self._plans, target or TARGET)
-            good_enough = min(p.error for p in within) <= (target or TARGET)
-            self.too_long = None if good_enough or wished.error > (target or TARGET) else wished
+        wished, aim = choose(self._plans, target or TARGET), target or TARGET
+        self.too_long = wished if wished.error <= aim < min(p.error for p in within) else None
 
     @property
     def plan(self) -> Plan:

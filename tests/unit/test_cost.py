@@ -3,12 +3,14 @@
 import importlib.util
 import random
 import time
+from threading import Thread
 from types import ModuleType, SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numba
 import pytest
+from numba.core.event import end_event, start_event
 
 from mi_sparse_prt.core.profiling import Stopwatch
 
@@ -80,6 +82,27 @@ def test_a_phase_that_fails_is_counted_too(now):
         now.passes(4)
     assert clock.report() == {"a": 1, "b": 2, "c": 4, "other": 0, "total": 7, "compile": 0}
     assert not dr.flag(dr.JitFlag.KernelHistory)
+
+
+def test_threads_that_compile_do_not_meet_in_a_phase(now):
+    """Two threads compile at once: numba tells of the second one's start before the first one's end.
+
+    Expected: no error, and the time of other threads stays in the phase of the one that waits for them.
+    """
+    clock = Stopwatch()
+    with clock.phase("a"):
+        now.passes(1)
+        start_event("numba:compiler_lock")
+        other = Thread(target=lambda: start_event("numba:compiler_lock"))
+        other.start()
+        other.join()
+        now.passes(2)
+        end_event("numba:compiler_lock")
+        now.passes(4)
+        other = Thread(target=lambda: end_event("numba:compiler_lock"))
+        other.start()
+        other.join()
+    assert clock.report() == {"a": 5, "other": 0, "total": 7 - 2, "compile": 2}
 
 
 def test_numba_compiles_apart_from_the_phase_that_calls():
