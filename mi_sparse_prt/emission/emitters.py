@@ -267,7 +267,7 @@ def _emitter_names(scene: Scene) -> dict[str, int]:
     numbers = dr.reinterpret_array(mi.UInt32, scene.mitsuba.emitters_dr()).numpy().tolist()
     on_shapes = {
         int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter())).numpy()[0]): mesh.name
-        for shape, mesh in zip(scene.mitsuba.shapes(), scene.meshes, strict=True)
+        for shape, mesh in zip(scene.mitsuba.shapes(), scene.fronts, strict=True)
         if shape.is_emitter()
     }
     names: dict[str, int] = {}

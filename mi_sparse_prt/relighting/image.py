@@ -42,9 +42,6 @@ class RelitScene:
     lamps : (SampledEmission, (size, 3) float32), optional
         Light of the scene that is seen itself, and how bright they are.
 
-    Notes
-    -----
-    Only the side of a surface that its normals point to has light; the other side is black.
     """
 
     def __init__(
@@ -57,7 +54,8 @@ class RelitScene:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
-        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
+        self._backs = mi.Int32(scene.backs.astype(np.int32))
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
 
@@ -66,8 +64,9 @@ class RelitScene:
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
         valid = active & si.is_valid()
-        front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
-        value = dr.select(front, self._shaded(si, self._hit_corners(hit, valid), valid), 0)
+        behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
+        corners, lit = self._hit_corners(hit, valid, behind)
+        value = dr.select(lit, self._shaded(si, corners, lit), 0)
         if self._background is not None:
             value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
         if self._lamps is not None:
@@ -76,14 +75,22 @@ class RelitScene:
             value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
         return value, valid
 
-    def _hit_corners(self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask) -> list[Corner]:
+    def _hit_corners(
+        self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask, behind: mi.Mask
+    ) -> tuple[list[Corner], mi.Mask]:
+        """The vertices around each hit, on the sheet that it is on, and whether that has any."""
         triangle = self._first_triangle.gather(hit.shape, valid) + hit.prim_index
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
-        return list(zip(vertices, (1 - u - v, u, v), strict=True))
+        backs = [dr.gather(mi.Int32, self._backs, vertex, behind) for vertex in vertices]
+        valid &= ~behind | (backs[0] >= 0)
+        vertices = [
+            dr.select(behind, mi.UInt32(back), vertex) for back, vertex in zip(backs, vertices, strict=True)
+        ]
+        return list(zip(vertices, (1 - u - v, u, v), strict=True)), valid
 
     def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
-        """Radiance that leaves the fronts of surfaces."""
+        """Radiance that leaves surfaces."""
         irradiance, albedo = (
             interpolated(values, corners, valid) for values in (self._irradiance, self._albedo)
         )
@@ -157,10 +164,11 @@ class GlossyRelitScene(RelitScene):
             super()._shaded(si, corners, valid),
         )
         towards = si.to_world(si.wi)
+        normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
         for vertex, weight in corners:
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
-            s = dr.normalize(tangent - si.sh_frame.n * dr.dot(si.sh_frame.n, tangent))
-            local = mi.Frame3f(s, dr.cross(si.sh_frame.n, s), si.sh_frame.n).to_local(towards)
+            s = dr.normalize(tangent - normal * dr.dot(normal, tangent))
+            local = mi.Frame3f(s, dr.cross(normal, s), normal).to_local(towards)
             lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
             for k, values in enumerate(self._terms):
                 coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
