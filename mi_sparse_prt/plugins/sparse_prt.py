@@ -133,7 +133,9 @@ class SparsePRT(mi.SamplingIntegrator):
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         if transport.terms:
             return GlossyRelitScene(surfaces, transport, environment, environment)
-        return RelitScene(surfaces, transport.irradiance(environment), environment)
+        return RelitScene(
+            surfaces, transport.irradiance(environment), environment, max_depth=transport.max_depth
+        )
 
     def to_string(self) -> str:
         return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"

@@ -1,4 +1,8 @@
-"""R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4)."""
+"""R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4).
+
+Rays go on through mirrors, glass and masks, by Mitsuba's own samples of what these scatter into single directions,
+until they meet no more of it.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,7 @@ from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart
+MOST_MIRRORS = 64  # that a ray meets, where ``max_depth`` sets no limit
 
 Corner = tuple[
     Any, Any
@@ -41,7 +46,9 @@ class RelitScene:
         What rays see that leave the scene.
     lamps : (SampledEmission, (size, 3) float32), optional
         Light of the scene that is seen itself, and how bright they are.
-
+    max_depth : int
+        As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts. That light of the vertices has
+        made fewer bounces then is left out of account.
     """
 
     def __init__(
@@ -50,8 +57,11 @@ class RelitScene:
         irradiance: NDArray[np.float32],
         background: mi.Emitter | None,
         lamps: tuple[SampledEmission, NDArray[np.float32]] | None = None,
+        max_depth: int = -1,
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
+        self._most = max_depth if 0 <= max_depth < MOST_MIRRORS else MOST_MIRRORS
+        self._goes_on = any(material.single_directions for material in scene.materials)
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
@@ -59,21 +69,57 @@ class RelitScene:
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
 
-    def radiance(self, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+    def radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
+        if self._goes_on:
+            return self._followed(ray, sampler, active)
+        value, si = self._met(ray, mi.Point2f(0.5), active, active)
+        return value, active & si.is_valid()
+
+    @dr.syntax
+    def _followed(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+        """As ``radiance``, where rays go on."""
+        context = mi.BSDFContext()
+        context.type_mask = int(mi.BSDFFlags.Delta)
+        ray, active = mi.Ray3f(ray), mi.Mask(active)
+        total, throughput = mi.Color3f(0), mi.Color3f(1)
+        depth, valid = mi.UInt32(0), mi.Mask(False)
+        most = dr.opaque(mi.UInt32, self._most)
+        active &= depth < most
+        while active:
+            u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
+            value, si = self._met(ray, u, active, active & (depth + 1 < most))
+            total += dr.select(active, throughput * value, 0)
+            active &= si.is_valid()
+            valid |= active
+            bsdf = si.bsdf()
+            active &= _scatters_into_single_directions(bsdf)
+            sample, weight = bsdf.sample(
+                context, si, sampler.next_1d(active), mi.Point2f(sampler.next_2d(active)), active
+            )
+            throughput *= weight
+            ray = si.spawn_ray(si.to_world(sample.wo))
+            depth += 1
+            active &= (depth < most) & (dr.max(throughput) > 0)
+        return total, valid
+
+    def _met(
+        self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask
+    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
+        """Radiance of what rays meet, which is that of surfaces only where these are asked for, and what that is."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
-        valid = active & si.is_valid()
+        valid = reflects & si.is_valid()
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
         corners, lit = self._hit_corners(hit, valid, behind)
-        value = dr.select(lit, self._shaded(si, corners, lit), 0)
+        value = dr.select(lit, self._shaded(si, corners, u, lit), 0)
         if self._background is not None:
             value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
-        return value, valid
+        return value, si
 
     def _hit_corners(
         self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask, behind: mi.Mask
@@ -89,17 +135,29 @@ class RelitScene:
         ]
         return list(zip(vertices, (1 - u - v, u, v), strict=True)), valid
 
-    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
-        """Radiance that leaves surfaces."""
+    def _shaded(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> mi.Color3f:
+        """Radiance that leaves surfaces, but for what they scatter into single directions."""
         irradiance, albedo = (
             interpolated(values, corners, valid) for values in (self._irradiance, self._albedo)
         )
         bsdf = si.bsdf()
-        diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(
-            bsdf.flags(), mi.BSDFFlags.Delta
-        )
-        textured = bsdf.eval_diffuse_reflectance(si, valid)
-        return irradiance * dr.select(diffuse, textured, albedo)
+        flags = bsdf.flags()
+        diffuse = ~mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Delta)
+        reflected = dr.select(diffuse, bsdf.eval_diffuse_reflectance(si, valid), albedo)
+        if self._goes_on:
+            # a share of it is diffuse: what a random direction finds is that share, on average over all directions
+            shared = _scatters_into_single_directions(bsdf) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
+            out = mi.warp.square_to_cosine_hemisphere(u)
+            out.z = dr.mulsign(out.z, mi.Frame3f.cos_theta(si.wi))
+            value = bsdf.eval(mi.BSDFContext(), si, out, valid & shared)
+            reflected = dr.select(shared, value * dr.pi / dr.maximum(dr.abs(out.z), 1e-6), reflected)
+        return irradiance * reflected
+
+
+def _scatters_into_single_directions(bsdf: mi.BSDFPtr) -> mi.Mask:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # Null is among them
 
 
 def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
@@ -133,7 +191,7 @@ class GlossyRelitScene(RelitScene):
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients(environment), transport.reflection
         assert isinstance(surfaces, InOutFactors)
-        super().__init__(scene, found.unit_albedo, background)
+        super().__init__(scene, found.unit_albedo, background, max_depth=transport.max_depth)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
@@ -151,7 +209,9 @@ class GlossyRelitScene(RelitScene):
         }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
 
-    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+    def _shaded(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> mi.Color3f:
         glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
         material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
         diffuse = interpolated(self._diffuse, corners, glossy)
@@ -161,7 +221,7 @@ class GlossyRelitScene(RelitScene):
         total = dr.select(
             glossy,
             interpolated(self._irradiance, corners, glossy) * diffuse,
-            super()._shaded(si, corners, valid),
+            super()._shaded(si, corners, u, valid),
         )
         towards = si.to_world(si.wi)
         normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
@@ -196,7 +256,7 @@ class RelitIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Mask = True,
     ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
-        value, valid = self._relit.radiance(mi.Ray3f(ray), mi.Mask(active))
+        value, valid = self._relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))
         return value, valid, []
 
 
@@ -263,7 +323,7 @@ def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> R
         return GlossyRelitScene(scene, transport, environment, background)
     dark = transport.measurement.kind != "vertices"
     irradiance = np.zeros((scene.n_vertices, 3), np.float32) if dark else transport.irradiance(environment)
-    return RelitScene(scene, irradiance, background, lamps)
+    return RelitScene(scene, irradiance, background, lamps, transport.max_depth)
 
 
 def _rendered(

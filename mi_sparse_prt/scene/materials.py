@@ -50,6 +50,8 @@ class Material:
         It reflects light on its back, too, by more than a mirror's single direction.
     passes_light : bool
         Some light goes through it.
+    single_directions : bool
+        It scatters some light into single directions: a mirror, glass, a mask.
     constant : bool
         It certainly does not vary over the surface nor with its rotation.
     """
@@ -84,6 +86,7 @@ class Material:
         self._lambertian = flags & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.DiffuseReflection)
         self.diffuse = self._lambertian and not self._classes & BUMPED
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
+        self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
         self.constant = self._classes <= PLAIN
 
@@ -142,7 +145,7 @@ class Material:
         return np.ascontiguousarray(np.minimum(albedo, 1))
 
     def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
-        """The share of light from the normal's direction that is reflected: a mean of stratified samples."""
+        """The share of light from the normal's direction that is reflected, but for mirrors: a mean of samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
         n = 8  # strata per axis
@@ -152,7 +155,8 @@ class Material:
             lobe, x, y = (dr.opaque(mi.Float, value) for value in (lobe, x, y))  # one kernel for all strata
             u = mi.Point2f(x, y)
             sample, weight = self.bsdf.sample(context, si, lobe, u)
-            total += dr.select(sample.wo.z * self._side > 0, mi.Color3f(weight), 0)
+            single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            total += dr.select((sample.wo.z * self._side > 0) & ~single, mi.Color3f(weight), 0)
             dr.eval(total)
         return dr.clip(total / (n * n), 0, 1)
 

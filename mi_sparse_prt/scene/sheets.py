@@ -124,7 +124,8 @@ def _bright_pieces(scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids)
     looks = _Looks(scene, meshes, pieces)
     size = np.bincount(pieces[pieces >= 0], minlength=n)
     for pass_, rays in enumerate((FEW_RAYS, MANY_RAYS)):
-        some = np.flatnonzero((pieces >= 0) & ~sees_light[pieces])
+        some = np.flatnonzero(pieces >= 0)
+        some = some[~sees_light[pieces[some]]]
         each = -(-rays // size[pieces[some]])  # rays from each triangle
         for a in range(0, len(some), LANES // rays):
             part = slice(a, a + LANES // rays)
