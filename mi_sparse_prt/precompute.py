@@ -33,6 +33,7 @@ from mi_sparse_prt.reflection.surfaces import vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
 
 DECISION = 5  # spawn key of held-out elements that decide something
@@ -156,7 +157,8 @@ def precompute(
     with run.clock.phase("setup"):
         glossy = settings.view_dependent
         seen = vertex_reflection(scene, terms, harmonics) if glossy else _diffuse(scene, where)
-        problem = Problem(scene, lighting, where, seen, basis, max_depth)
+        apart = scene.specular and not glossy and where.kind == "vertices" and max_depth != 2
+        problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
 
@@ -167,8 +169,14 @@ class _Attempts:
     def __init__(self, direct: DirectSolver, settings: Settings, run: Run) -> None:
         self._direct, self._problem, self._settings, self._run = direct, direct.problem, settings, run
         self._dark = _no_indirect(direct.problem, settings, run.clock)
+        specular = None
+        if self._dark is None and self._problem.specular_apart:
+            with run.clock.phase("specular"):
+                good_enough = (settings.target_error or TARGET) / 4
+                options = SpecularOptions(negligible=good_enough)
+                specular = specular_light(self._problem, run.seed, options)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
-        self._execution = Execution(direct, settings, self._dark is None, run)
+        self._execution = Execution(direct, settings, self._dark is None, run, specular)
         self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
 
     def matrix(self) -> LightTransport:

@@ -50,6 +50,10 @@ class Effort:
         Paths for each of these.
     strata : int
         Texel basis: shadow rays per axis of a texel.
+    specular : int
+        Rows for light by way of mirrors and glass, of all meshes together.
+    specular_strata : int
+        Rays for these, in each of four estimates: strata per axis of a part of the hemisphere.
     """
 
     rays: float = 0.002
@@ -59,6 +63,8 @@ class Effort:
     fewest_paths: int = 64
     spp: int = 512
     strata: int = 4
+    specular: int = 256
+    specular_strata: int = 8
 
     def rays_of(self, total: int, n_meshes: int) -> float:
         """How many elements of a mesh, one of ``n_meshes``, are drawn for direct light that is bits, about."""

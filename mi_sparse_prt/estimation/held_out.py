@@ -32,6 +32,7 @@ from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.solvers.term_paths import TermPaths, TermRays
 from mi_sparse_prt.transport import LightTransport
 
@@ -197,7 +198,39 @@ class _Estimator:
             ends = np.cumsum([len(each.weights) for each in some])[:-1]
             parts = zip(*(np.split(part, ends) for part in vars(whole).values()), strict=True)
             found |= {key: Sample(*part) for key, part in zip(keys, parts, strict=True)}
-        return {key: found[key] for key in chosen}
+        found = {key: found[key] for key in chosen}
+        if "specular" in self._transport.operators:
+            found |= self._specular(rng, part)
+        return found
+
+    def _specular(self, rng: np.random.Generator, part: float) -> Samples:
+        """Light by way of mirrors and glass: whole rows, against two independent estimates of these."""
+        sizes = [mesh.vertices.stop - mesh.vertices.start for mesh in self._transport.meshes]
+        counts = [
+            min(size, max(1, round(part * self._effort.specular * size / sum(sizes)))) for size in sizes
+        ]
+        ids = np.concatenate(
+            [
+                mesh.vertices.start + np.sort(rng.choice(size, count, replace=False))
+                for mesh, size, count in zip(self._transport.meshes, sizes, counts, strict=True)
+            ]
+        )
+        once = SpecularOptions(self._effort.specular_strata, self._effort.specular_strata)
+        ours = self._transport.operators["specular"].rows(ids).astype(np.float64)
+        seeds = rng.integers(1 << 32, size=2)
+        x, y = (
+            specular_light(self._problem, int(s), once, ids).operator.rows(np.arange(len(ids))) for s in seeds
+        )
+        power = np.square(self._problem.reflection.albedo[ids].astype(np.float64))
+        sums = [np.broadcast_to((a * b).sum(axis=1), power.shape) for a, b in ((ours - x, ours - y), (x, y))]
+        weights = np.repeat(np.divide(sizes, counts), counts)
+        columns = [np.stack([(power * s).sum(axis=1), s.sum(axis=1)], axis=1) for s in sums]
+        ends = np.cumsum(counts)[:-1]
+        parts = zip(*(np.split(array, ends) for array in (weights, *columns)), strict=True)
+        return {
+            (mesh.name, "specular"): Sample(*one)
+            for mesh, one in zip(self._transport.meshes, parts, strict=True)
+        }
 
     def _batches(self, chosen: dict[tuple[str, str], Chosen]) -> Iterator[list[tuple[str, str]]]:
         """Those to evaluate together: of one part, with as many rows per point, and not too many."""

@@ -20,6 +20,7 @@ from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.methods.sparse import SparseOptions, sparse_parts
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
@@ -30,6 +31,7 @@ from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import Gathered, RadiositySolver
+from mi_sparse_prt.solvers.specular import SpecularLight
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.transport import LightTransport
@@ -46,21 +48,38 @@ class Execution:
     indirect : bool
         Whether there is indirect light.
     run : Run
+    specular : SpecularLight, optional
+        Where it is an operator of its own.
     """
 
-    def __init__(self, direct: DirectSolver, settings: Settings, indirect: bool, run: Run) -> None:
+    def __init__(
+        self,
+        direct: DirectSolver,
+        settings: Settings,
+        indirect: bool,
+        run: Run,
+        specular: SpecularLight | None = None,
+    ) -> None:
         self._problem, self._solver = direct.problem, direct
         self._settings, self._any_indirect, self._run = settings, indirect, run
         self._direct: dict[str, MethodResult] = {}
+        self._specular, self._specular_rays = specular, 0 if specular is None else specular.rays
 
     def parts(self, plan: Plan) -> MethodResult:
         """The parts of the matrix, and an account of what was evaluated for them by this call."""
         if plan.direct in TOGETHER:
-            return self._together(plan)
-        light = self.direct_light(plan.direct)
+            return self._with_specular(self._together(plan))
+        light = self._with_specular(self.direct_light(plan.direct))
         if plan.indirect == "none" or not self._any_indirect:
             return light
         return self._gathered(plan, light) if plan.indirect == "gather" else self._path_traced(plan, light)
+
+    def _with_specular(self, light: MethodResult) -> MethodResult:
+        """With what arrives by way of mirrors and glass; that costs nothing the second time."""
+        if self._specular is None:
+            return light
+        rays, self._specular_rays = self._specular_rays, 0
+        return replace(light, specular=self._specular, rays=light.rays | {"specular": rays})
 
     def direct_light(self, how: str) -> MethodResult:
         """Direct light alone; it costs nothing the second time."""
@@ -116,7 +135,9 @@ class Execution:
             gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
         with clock.phase("interreflection"):
             if sources is problem:
-                part = gather.indirect(light.direct, plan.tolerance)
+                specular = () if light.specular is None else (light.specular.operator,)
+                sent = Sum((light.direct, *specular)) if specular else light.direct
+                part = gather.indirect(sent, plan.tolerance)
             else:
                 part = gather.seen_from(problem.points, known.direct, plan.tolerance)
         rays = light.rays | {"gather": gather.rays}
@@ -182,6 +203,8 @@ def _left_out(part: Gathered) -> list[str]:
 def matrix_of(problem: Problem, parts: MethodResult) -> LightTransport:
     """The matrix of parts that were evaluated, without a report."""
     operators = {"direct": parts.direct} | ({} if parts.indirect is None else {"indirect": parts.indirect})
+    if parts.specular is not None:
+        operators["specular"] = parts.specular.operator
     return LightTransport(
         problem.emission,
         problem.basis,

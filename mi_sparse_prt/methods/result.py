@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.solvers.specular import SpecularLight
 
 
 @dataclass
@@ -22,6 +23,8 @@ class MethodResult:
         ``direct`` and ``indirect``: how many elements of each part were evaluated.
     rays : dict
         ``direct``: shadow rays; ``indirect_paths``.
+    specular : SpecularLight or None
+        Light by way of mirrors and glass alone, where that is an operator of its own.
     skipped : list of str
         Sentences.
     sampling : dict
@@ -36,6 +39,7 @@ class MethodResult:
     elements_evaluated: int
     elements: dict[str, int]
     rays: dict[str, int]
+    specular: SpecularLight | None = None
     skipped: list[str] = field(default_factory=list)
     sampling: dict[str, Any] = field(default_factory=dict)
     radiosity: dict[str, Any] = field(default_factory=dict)

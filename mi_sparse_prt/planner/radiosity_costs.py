@@ -146,8 +146,8 @@ class GatherCosts:
 
 def gather_costs(
     direct: DirectSolver, held: PilotElements, seed: int | np.random.SeedSequence
-) -> GatherCosts | None:
-    """Measure at the vertices of the held-out elements; None where light cannot be gathered.
+) -> GatherCosts:
+    """Measure at the vertices of the held-out elements; what mirrors and glass add is left out, as from the paths.
 
     Parameters
     ----------
@@ -159,8 +159,6 @@ def gather_costs(
     """
     assert held.indirect is not None
     scene, stream = direct.problem.scene, random_stream(seed, GATHERED)
-    if not scene.diffuse:
-        return None
     pilot, seeds = _Pilot(direct, held.vertices), element_seeds(stream, 2)
     few, many = ([pilot.rays(count, k) for k in seeds] for count in (FEW, MANY))
     light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]

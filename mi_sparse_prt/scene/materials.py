@@ -52,6 +52,8 @@ class Material:
         Some light goes through it.
     single_directions : bool
         It scatters some light into single directions: a mirror, glass, a mask.
+    passes_straight : bool
+        Some of it goes straight on, as if nothing were there.
     constant : bool
         It certainly does not vary over the surface nor with its rotation.
     """
@@ -87,6 +89,7 @@ class Material:
         self.diffuse = self._lambertian and not self._classes & BUMPED
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
+        self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
         self.constant = self._classes <= PLAIN
 

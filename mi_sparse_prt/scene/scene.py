@@ -229,6 +229,16 @@ class Scene:
         """Whether all BSDFs reflect purely diffusely."""
         return all(material.diffuse for material in self.materials)
 
+    @property
+    def specular(self) -> bool:
+        """Whether any surface scatters light into single directions: mirrors, glass, masks."""
+        return any(material.single_directions for material in self.materials)
+
+    @property
+    def passes_straight(self) -> bool:
+        """Whether light goes straight through any surface."""
+        return any(material.passes_straight for material in self.materials)
+
     @cached_property
     def grey(self) -> bool:
         """Whether all surfaces provably reflect the three channels alike (within 1e-6)."""

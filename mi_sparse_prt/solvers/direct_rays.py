@@ -23,6 +23,8 @@ from mi_sparse_prt.solvers.problem import Problem
 
 Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
 
+ALL = 0.999  # of the light: what lets as much pass is not there
+
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
 
 
@@ -137,12 +139,55 @@ class DirectSolver:
     def trace(self, point: mi.UInt32, direction: mi.Vector3f, active: mi.Mask) -> tuple[mi.Mask, mi.Float]:
         """Which points see the sky in a direction (unit, world), and the cosine; lanes side by side.
 
-        Below the horizon no ray is traced and nothing is seen.
+        Below the horizon no ray is traced and nothing is seen. Surfaces are in the way unless they let all light pass.
         """
         cosine = dr.dot(self._points.normal(point), direction)
         active &= cosine > 0
         ray = start_ray(self._points, point, direction)
-        return active & ~self.scene.ray_test(ray, active=active), cosine
+        blocked = self.scene.ray_test(ray, active=active)
+        if self.problem.scene.passes_straight:
+            blocked &= self._transmittance(ray, active & blocked) < ALL
+        return active & ~blocked, cosine
+
+    def passed(self, point_ids: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Unit-albedo transport (n, n_directions) of what surfaces let a part through of, and not all."""
+        ids = mi.UInt32(np.append(point_ids, point_ids[-1:]).astype(np.uint32))
+        element, stratum = self._lanes(len(point_ids) * self._n_texels)
+        row = element // self._n_texels
+        texel = element - row * self._n_texels
+        point = dr.gather(mi.UInt32, ids, row)
+        if self.basis == "direction":
+            direction, area, total = self._texels.centre(texel), mi.Float(1), mi.Float(1)
+        else:
+            direction, area, total = self._inside(point, texel, stratum, self.seed)
+        cosine = dr.dot(self._points.normal(point), direction)
+        ray = start_ray(self._points, point, direction)
+        blocked = self.scene.ray_test(ray, active=cosine > 0)
+        share = self._transmittance(ray, blocked)
+        value = dr.select(blocked & (share < ALL), share * cosine * area, 0)
+        mean = dr.block_reduce(dr.ReduceOp.Add, value, self.rays_per_element) / total
+        power = self.lighting.solid_angles / np.float32(np.pi)
+        return mean.numpy().reshape(-1, self._n_texels) * power
+
+    @dr.syntax
+    def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
+        """The share of light that comes straight through surfaces, each of which counts as a bounce.
+
+        Of colours the mean.
+        """
+        depth = self.problem.max_depth
+        most = dr.opaque(mi.UInt32, depth - 2 if depth >= 0 else 1 << 30)
+        share, count = mi.Float(1), mi.UInt32(0)
+        ray, active = mi.Ray3f(ray), mi.Mask(active)
+        while active:
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            passed = mi.Color3f(si.bsdf().eval_null_transmission(si, active))
+            share = dr.select(active, dr.select(count < most, share * dr.mean(passed), 0), share)
+            count += 1
+            ray = si.spawn_ray(ray.d)
+            active &= share > 0
+        return share
 
     def weighted_means(
         self, points: mi.UInt32, texels: mi.UInt32, weights: Weights, seed: int | None = None
@@ -171,15 +216,21 @@ class DirectSolver:
 
         Samples weigh by their solid angles over the sum of these, so that a mean cosine never leaves [0, 1].
         """
+        direction, area, total = self._inside(point, texel, stratum, seed)
+        visible, cosine = self.trace(point, direction, mi.Mask(True))
+        seen = dr.select(visible, cosine * area, 0)
+        return [
+            dr.block_reduce(dr.ReduceOp.Add, seen * weight, self.rays_per_element) / total
+            for weight in weights(point, direction)
+        ]
+
+    def _inside(
+        self, point: mi.UInt32, texel: mi.UInt32, stratum: mi.UInt32, seed: int
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """A direction in each stratum of a texel, its weight, and the sum of weights of each element."""
         rng = random_generator(self._points.key(point), texel, stratum, seed)
         row = stratum // self.strata
         u = (mi.Float(stratum - row * self.strata) + rng.next_float32()) / self.strata
         v = (mi.Float(row) + rng.next_float32()) / self.strata
         direction, area = self._texels.inside(texel, u, v)
-        visible, cosine = self.trace(point, direction, mi.Mask(True))
-        seen = dr.select(visible, cosine * area, 0)
-        total = dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)
-        return [
-            dr.block_reduce(dr.ReduceOp.Add, seen * weight, self.rays_per_element) / total
-            for weight in weights(point, direction)
-        ]
+        return direction, area, dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)

@@ -89,10 +89,10 @@ class Surfaces:
 
     def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
         """A vertex or NOTHING for every ray; u in [0, 1) chooses among the corners of a triangle."""
-        return self._vertex(self._scene.ray_intersect_preliminary(ray), ray.d, u)
+        return self.corner(self._scene.ray_intersect_preliminary(ray), ray.d, u)
 
-    def _vertex(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
-        """The corner of each hit triangle that u in [0, 1) selects."""
+    def corner(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
+        """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING."""
         valid = hit.is_valid()
         first = self._first_triangle.gather(hit.shape, valid)
         corners = [

@@ -162,17 +162,22 @@ class PathSolver:
     def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
         """One sample of the radiance that first rays find on other surfaces, per d_omega."""
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
-        if self.basis == "direction":
+        apart = self.problem.specular_apart
+        if self.basis == "direction" and not apart:
             return trace_reflected(
                 self.scene, ray, Light(distant(self._texels.centre(texel), mi.Float(1))), rng, bounces
             )
         # Radiance 1 over the texel: each path sees its own direction in it, weighted to 1 on average.
-        direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
         mean = self._texels.solid_angle(texel)
-        light = Light(distant(direction, solid_angle / mean))
+        if self.basis == "direction":
+            shadow = distant(self._texels.centre(texel), mi.Float(1))
+        else:
+            direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
+            shadow = distant(direction, solid_angle / mean)
+        light = Light(shadow)
         if has_mirrors(self.scene):
             inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
-            light = Light(distant(direction, solid_angle / mean), inside, 1 / mean)
+            light = Light(shadow, inside, 1 / mean, apart)
         return trace_reflected(self.scene, ray, light, rng, bounces)
 
 
@@ -189,11 +194,14 @@ class Light:
         A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths
         that leave the scene right after one collect ``radiance`` if they leave towards the light.
     radiance : Float, optional
+    scattered : bool
+        Only paths collect it that another surface has scattered on the way.
     """
 
     sample: Callable[[Any, Any], tuple[Any, Any, Any]]
     contains: Callable[[mi.Vector3f], mi.Mask] | None = None
     radiance: mi.Float | None = None
+    scattered: bool = False
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
@@ -218,12 +226,12 @@ def trace_reflected(
     ray = mi.Ray3f(ray)
     result, throughput = mi.Color3f(0), mi.Color3f(1)
     depth = mi.UInt32(0)
-    mirrored = mi.Mask(False)
+    mirrored, counts = mi.Mask(False), mi.Mask(not light.scattered)
     active = mi.Mask(depth < bounces)
     while active:
         si = scene.ray_intersect(ray, active)
         if light.contains is not None:
-            escaped = active & mirrored & ~si.is_valid()
+            escaped = active & mirrored & counts & ~si.is_valid()
             result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
         active &= si.is_valid() & (depth < bounces)
 
@@ -251,6 +259,7 @@ def trace_reflected(
         throughput *= weight
         ray = si.spawn_ray(si.to_world(sample.wo))
         mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        counts |= ~mirrored
         active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
         if light.contains is None:
             active &= depth < bounces

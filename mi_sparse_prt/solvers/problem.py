@@ -30,6 +30,9 @@ class Problem:
         How the light of a column arrives, if that is a cubemap's texel.
     max_depth : int
         As Mitsuba's ``path``: 2 = direct light only, 5 = three interreflections, -1 = no limit.
+    specular_apart : bool
+        Light that comes from the sky by way of mirrors and glass alone is not part of the indirect light, but an
+        operator of its own (``solvers.specular``).
     """
 
     scene: Scene
@@ -38,6 +41,7 @@ class Problem:
     reflection: Reflection
     basis: str = "direction"
     max_depth: int = 5
+    specular_apart: bool = False
 
     @property
     def points(self) -> Points:

@@ -27,10 +27,10 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 
@@ -294,7 +294,7 @@ class FiniteElements:
 
 
 class RadiositySolver(FiniteElements):
-    """Indirect light at the vertices of a diffuse scene.
+    """Indirect light at the vertices of a scene.
 
     Parameters
     ----------
@@ -320,10 +320,10 @@ class RadiositySolver(FiniteElements):
     rays : int
         That were traced.
 
-    Raises
-    ------
-    PrtError
-        If a surface is not diffuse.
+    Notes
+    -----
+    Surfaces that scatter light into single directions are followed; others that are not diffuse count as diffuse, of
+    the same albedo.
     """
 
     def __init__(
@@ -335,10 +335,9 @@ class RadiositySolver(FiniteElements):
         options: LowRankOptions | None = None,
     ) -> None:
         scene, points, emission = problem.scene, problem.points, problem.emission
-        _check_diffuse(scene)
         nodes = nodes or Nodes(np.arange(len(points)), None)
         super().__init__(
-            gather_matrix(scene, points, rays_per_vertex, seed, nodes.ids),
+            form_factors(problem, rays_per_vertex, seed, nodes.ids),
             np.ascontiguousarray(scene.albedo.T[: problem.channels]),
             points.keys,
             nodes,
@@ -382,10 +381,9 @@ def _energies(x: Floats) -> NDArray[np.float64]:
     return np.square(x).sum(axis=0, dtype=np.float64)
 
 
-def _check_diffuse(scene: Scene) -> None:
-    for material in scene.materials:
-        if not material.diffuse:
-            raise PrtError(
-                f"shape '{material.name}' is not diffuse: light is gathered from diffuse surfaces only; "
-                "use path tracing instead"
-            )
+def form_factors(problem: Problem, rays: int, seed: int, ids: NDArray[np.integer]) -> scipy.sparse.csr_array:
+    """G (n, n_v) of some of a problem's points; rays go on through specular surfaces where their light is apart."""
+    matrix = gather_matrix(problem.scene, problem.points, rays, seed, ids)
+    if not problem.specular_apart:
+        return matrix
+    return scipy.sparse.csr_array(matrix + specular_form_factors(problem, ids, rays, seed))

@@ -1,0 +1,354 @@
+"""Light that arrives by way of mirrors, glass and masks: rays go on until they meet no more of it.
+
+What scatters light into single directions keeps no rows: Mitsuba's own BSDF samples say where a ray goes on, and with
+which weight. Where it meets a surface that reflects diffusely as well, that is an entry of the form-factor matrix;
+where it leaves the scene, it is light of the texel that it leaves to. Light of the second kind is sharp and noisy: it
+is an operator of its own, with few elements, found by as many rays as its noise asks for.
+
+Light that goes straight through (masks, thin panes, ``null``) needs no random rays: see ``passed_light``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.random_keys import element_seeds, random_generator, random_stream
+from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.operators.sparse_rows import SparseRows
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.solvers.problem import Problem
+
+LANES = 1 << 22  # rays per wavefront
+PARTS = 16  # of a hemisphere, per axis
+MOST = 16  # surfaces on the way, where ``max_depth`` sets no limit
+SPECULAR = 7  # spawn key
+
+Sparse: TypeAlias = scipy.sparse.csr_array
+
+
+@dataclass(frozen=True)
+class SpecularOptions:
+    """How many rays look for specular light.
+
+    Attributes
+    ----------
+    first : int
+        Strata per axis of a part of the hemisphere, each with a ray, in each of two independent halves.
+    last : int
+        At most; there are twice as many each time, until the noise is small enough.
+    noise : float
+        Relative L2 of all specular light that is good enough.
+    negligible : float
+        Noise relative to light that nothing blocks, L2, that is good enough as well.
+    strata : int
+        Texel basis: rays per axis of a texel, for light that goes straight on and of which a part is lost.
+    """
+
+    first: int = 2
+    last: int = 16
+    noise: float = 0.1
+    negligible: float = 0.003
+    strata: int = 2
+
+
+class SpecularLight(NamedTuple):
+    """Light from the sky by way of specular surfaces alone.
+
+    Attributes
+    ----------
+    operator : SparseRows
+        Unit-albedo transport.
+    noise : float
+        Its relative L2 error, as estimated from two halves.
+    rays : int
+        That were traced.
+    """
+
+    operator: SparseRows
+    noise: float
+    rays: int
+
+
+class _Found(NamedTuple):
+    """Ends of rays: which row each belongs to, a column, and its weight per channel (n, 3)."""
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    weights: NDArray[np.float32]
+
+
+class SpecularRays:
+    """Rays from points that go on where they meet specular surfaces.
+
+    Parameters
+    ----------
+    problem : Problem
+        Light of a cubemap.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._scene, self._surfaces = problem.scene.normalised, Surfaces(problem.scene)
+        self._points = PointArrays(problem.points)
+        self._resolution = problem.emission.resolution
+        self._most = most_on_the_way(problem.max_depth)
+
+    def parts_that_see(self, ids: Ids, seed: int) -> tuple[Ids, Ids]:
+        """Parts of the hemispheres of points in which, or next to which, a ray meets a specular surface.
+
+        There are PARTS x PARTS of a hemisphere, all of the same cosine-weighted solid angle; a ray goes into each.
+
+        Returns
+        -------
+        rows, parts : (m,) int64
+            ``rows`` count ``ids``.
+        """
+        found = []
+        for a in range(0, len(ids), LANES // PARTS**2):
+            some = ids[a : a + LANES // PARTS**2]
+            rows, parts = (x.ravel() for x in np.indices((len(some), PARTS**2)))
+            ray, _, _ = self._rays(some, rows, parts, 1, seed)
+            seen = self._is_specular(ray).numpy().reshape(-1, PARTS, PARTS)
+            grown = scipy.ndimage.maximum_filter(seen, (1, 3, 3))
+            row, part = np.nonzero(grown.reshape(len(some), -1))
+            found.append((a + row, part))
+        rows, parts = (np.concatenate(x) for x in zip(*found, strict=True))
+        return rows, parts
+
+    def sky(self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int) -> _Found:
+        """Texels to which rays from points leave the scene, but for those that went straight all the way.
+
+        Parameters
+        ----------
+        ids : (n,) integers
+            Points.
+        rows, parts : (m,) int64
+            Of ``parts_that_see``.
+        strata : int
+            Per axis of a part, each with a ray.
+        seed : int
+
+        Returns
+        -------
+        _Found
+            Weights are those of unit-albedo transport.
+        """
+        ray, row, rng = self._rays(ids, rows, parts, strata, seed)
+        found = [
+            _Found(*(x[~hits] for x in (rows, columns, weights)))
+            for rows, columns, weights, hits in self._walked(ray, row, rng)
+        ]
+        rows, columns, weights = _joined(found)
+        return _Found(rows, columns, weights / np.float32((PARTS * strata) ** 2))
+
+    def surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> _Found:
+        """Vertices of the surfaces that cosine-distributed rays from some points meet after specular ones."""
+        ray, point, _ = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
+        lane = dr.arange(mi.UInt32, len(ids) * len(samples[0]))
+        row = lane // len(samples[0])
+        rng = random_generator(self._points.key(point), lane - row * len(samples[0]), mi.UInt32(1), seed)
+        found = []
+        for depth, (rows, columns, weights, hits) in enumerate(self._walked(ray, row, rng), 1):
+            if depth < self._most:  # light of that surface makes one more bounce
+                found.append(_Found(*(x[hits] for x in (rows, columns, weights))))
+        rows, columns, weights = _joined(found)
+        return _Found(rows, columns, weights / np.float32(len(samples[0])))
+
+    def _rays(
+        self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int
+    ) -> tuple[mi.Ray3f, mi.UInt32, mi.PCG32]:
+        """Rays into parts of hemispheres, one in each stratum, their rows, and random numbers for the rest."""
+        lane = dr.arange(mi.UInt32, len(rows) * strata**2)
+        entry = lane // strata**2
+        stratum = lane - entry * strata**2
+        row, part = (dr.gather(mi.UInt32, mi.UInt32(x.astype(np.uint32)), entry) for x in (rows, parts))
+        point = dr.gather(mi.UInt32, mi.UInt32(ids.astype(np.uint32)), row)
+        rng = random_generator(self._points.key(point), part, stratum, seed)
+        fine = PARTS * strata
+        x = mi.Float((part % PARTS) * strata + stratum % strata) + rng.next_float32()
+        y = mi.Float((part // PARTS) * strata + stratum // strata) + rng.next_float32()
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x / fine, y / fine))
+        direction = mi.Frame3f(self._points.normal(point)).to_world(local)
+        return start_ray(self._points, point, direction), row, rng
+
+    def _is_specular(self, ray: mi.Ray3f) -> mi.Mask:
+        """Whether rays meet what scatters light into single directions."""
+        hit = self._scene.ray_intersect_preliminary(ray)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
+        return hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+
+    def _walked(self, ray: mi.Ray3f, row: mi.UInt32, rng: mi.PCG32) -> Iterator[tuple[Any, ...]]:
+        """After each specular surface: rows, columns, weights, and whether columns are vertices, not texels."""
+        context = mi.BSDFContext()
+        context.type_mask = int(mi.BSDFFlags.Delta)
+        index = dr.compress(self._is_specular(ray))  # few of them
+        ray, row, rng = (dr.gather(type(x), x, index) for x in (ray, row, rng))
+        weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
+        hit = self._scene.ray_intersect_preliminary(ray)
+        for _ in range(self._most):
+            if len(index) == 0:
+                return
+            si = hit.compute_surface_interaction(ray, active=hit.is_valid())
+            goes_on = hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+            goes_on &= dr.max(weight) > 0
+            u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+            scattered, share = si.bsdf().sample(context, si, *u, goes_on)
+            weight = dr.select(goes_on, weight * share, 0)
+            straight &= mi.has_flag(scattered.sampled_type, mi.BSDFFlags.Null)
+            ray = si.spawn_ray(si.to_world(scattered.wo))
+            hit = self._scene.ray_intersect_preliminary(ray, active=goes_on)
+            valid = hit.is_valid()
+            vertex = self._surfaces.corner(hit, ray.d, rng.next_float32())
+            texel = texel_at(*face_coordinates(ray.d), self._resolution)
+            column = dr.select(valid, vertex, dr.select(straight, NOTHING, texel))
+            ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
+            alive = goes_on & valid & (dr.max(weight) > 0)
+            dr.eval(row, column, weight, ends, valid, alive, ray, rng, straight, hit)
+            kept = ends.numpy()
+            yield (
+                row.numpy()[kept].astype(np.int64),
+                column.numpy()[kept].astype(np.int64),
+                weight.numpy().T[kept],
+                valid.numpy()[kept],
+            )
+            index = dr.compress(alive)
+            row, weight, straight, ray, rng, hit = (
+                dr.gather(type(x), x, index) for x in (row, weight, straight, ray, rng, hit)
+            )
+
+
+def most_on_the_way(max_depth: int) -> int:
+    """How many specular surfaces a ray may meet that then leaves the scene."""
+    return MOST if max_depth < 0 else min(max_depth - 2, MOST)
+
+
+def _joined(parts: list[_Found]) -> _Found:
+    if not parts:
+        none = np.zeros(0, np.int64)
+        return _Found(none, none, np.zeros((0, 3), np.float32))
+    return _Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> Sparse:
+    """What G (n, n_v) lacks without specular surfaces: what rays from some points find after these.
+
+    Parameters
+    ----------
+    problem : Problem
+    ids : (n,) integers
+        Points.
+    rays : int
+        From each, a power of two.
+    seed : int
+
+    Notes
+    -----
+    Weights of colours are averaged. A surface that is found after k specular ones sends out light of as many bounces as
+    any other, k more than Mitsuba's ``path`` would follow at the same depth.
+    """
+    walks, samples = SpecularRays(problem), sobol(rays)
+    step = max(1, LANES // rays)
+    shape = (0, problem.scene.n_vertices)
+    blocks = [scipy.sparse.csr_array(shape, dtype=np.float32)]
+    for a in range(0, len(ids), step):
+        part = ids[a : a + step]
+        rows, columns, weights = walks.surfaces(part, samples, seed)
+        entries = weights.mean(axis=1), (rows, columns)
+        blocks.append(scipy.sparse.coo_array(entries, shape=(len(part), shape[1])).tocsr())
+    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
+
+
+def specular_light(
+    problem: Problem,
+    seed: int,
+    options: SpecularOptions = SpecularOptions(),  # noqa: B008
+    ids: Ids | None = None,
+) -> SpecularLight:
+    """Light from the sky that arrives by way of mirrors and glass, at some points.
+
+    A few rays tell in which parts of its hemisphere a point sees specular surfaces; those are sampled, ever finer,
+    until the noise is small enough. What is smaller than a part, and met by no ray, is not found.
+
+    Parameters
+    ----------
+    problem : Problem
+    seed : int
+    options : SpecularOptions
+    ids : (n,) integers, optional
+        Points; all if not given.
+    """
+    every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
+    walks, albedo = SpecularRays(problem), problem.reflection.albedo[every]
+    seeds = iter(element_seeds(random_stream(seed, SPECULAR), 64))
+    rows, parts = walks.parts_that_see(every, next(seeds))
+    traced, strata, free = len(every) * PARTS**2, options.first, _unblocked(problem, albedo)
+    while True:
+        halves = [
+            _sampled(walks, every, (rows, parts), strata, next(seeds), problem.emission.size) for _ in "ab"
+        ]
+        traced += 2 * len(rows) * strata**2
+        square, noise = _compared(halves, albedo)
+        enough = noise <= max(options.noise**2 * square, options.negligible**2 * free)
+        if enough or strata >= options.last:
+            break
+        strata *= 2
+    mean = [(a + b) * np.float32(0.5) for a, b in zip(*halves, strict=True)]
+    if problem.scene.passes_straight:
+        passed = passed_light(DirectSolver(problem, options.strata, next(seeds)), every)
+        mean = [one + passed for one in mean]
+    grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
+    operator = SparseRows(tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean)))
+    return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), traced)
+
+
+def _sampled(
+    walks: SpecularRays, points: Ids, where: tuple[Ids, Ids], strata: int, seed: int, size: int
+) -> list[Sparse]:
+    """Light (points, size) of each channel, from rays into parts of hemispheres."""
+    shape, step = (len(points), size), max(1, LANES // strata**2)
+    sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
+    for a in range(0, len(where[0]), step):
+        some = [x[a : a + step] for x in where]
+        rows, columns, weights = walks.sky(points, some[0], some[1], strata, seed)
+        for c in range(3):
+            sums[c] = sums[c] + scipy.sparse.coo_array((weights[:, c], (rows, columns)), shape=shape).tocsr()
+    return sums
+
+
+def _compared(halves: list[list[Sparse]], albedo: NDArray[np.float32]) -> tuple[float, float]:
+    """Squared norm of radiance, and of the noise in the mean of the two halves."""
+    square, noise = 0.0, 0.0
+    for c, (a, b) in enumerate(zip(*halves, strict=True)):
+        power = np.square(albedo[:, c].astype(np.float64))
+        square += float(power @ (a.multiply(b)).sum(axis=1))
+        noise += float(power @ ((a - b).power(2)).sum(axis=1)) / 4
+    return max(square, 0.0), noise
+
+
+def _unblocked(problem: Problem, albedo: NDArray[np.float32]) -> float:
+    """Squared norm of radiance under light that nothing blocks: the mean square of a cosine is a sixth."""
+    weights = float(np.square(problem.emission.solid_angles.astype(np.float64) / np.pi).sum())
+    return weights / 6 * float(np.square(albedo.astype(np.float64)).sum())
+
+
+def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
+    """Light (n, m) of texels, at some points, of which surfaces on the way let a part through, straight on.
+
+    All of it, and nothing, is told by bits; here is what lies between.
+    """
+    step = max(1, LANES // (direct.lighting.size * direct.rays_per_element))
+    blocks = [
+        scipy.sparse.csr_array(direct.passed(np.asarray(ids[a : a + step]))) for a in range(0, len(ids), step)
+    ]
+    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)

@@ -1,0 +1,172 @@
+"""Light by way of mirrors, glass, masks and panes: gathered, passed straight on, and arriving from the sky."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import T, build, diffuse, problem_at
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+
+pytestmark = pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+FLOOR = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(1.5)}
+IDS = np.arange(0, 400, 7)
+CHECKERS = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "to_uv": T().scale(2)}
+
+
+def twosided(bsdf: dict) -> dict:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def objects(albedo: float) -> dict:
+    """A floor and a wall around a mirror, a glass ball, a half-open and a cut-out sheet, a pane and a box of air."""
+    grey = diffuse(albedo, albedo, albedo)
+
+    def card(x: float, y: float, z: float, bsdf: dict) -> dict:
+        return {"type": "rectangle", "to_world": T().translate([x, y, z]).scale(0.35), "bsdf": bsdf}
+
+    return {
+        "floor": {**FLOOR, "bsdf": grey},
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0.8, -1.6]), "bsdf": grey},
+        "mirror": {"type": "sphere", "center": [-0.8, 0.5, 0], "radius": 0.4, "bsdf": {"type": "conductor"}},
+        "glass": {"type": "sphere", "center": [0, 0.5, 0.3], "radius": 0.35, "bsdf": {"type": "dielectric"}},
+        "sheet": card(0.9, 0.5, 0, {"type": "mask", "opacity": 0.5, "bsdf": twosided(grey)}),
+        "cut": card(0.9, 0.5, 0.8, {"type": "mask", "opacity": CHECKERS, "bsdf": twosided(grey)}),
+        "pane": card(0, 0.5, 1.1, {"type": "thindielectric"}),
+        "air": {
+            "type": "cube",
+            "to_world": T().translate([-0.8, 0.4, 1]).scale(0.25),
+            "bsdf": {"type": "null"},
+        },
+    }
+
+
+@pytest.mark.parametrize("basis", ["texel", "direction"])
+def test_furnace(basis):
+    """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
+
+    Expected: every diffuse mesh has a mean irradiance of 1 within 1%, of which the parts that are new are 2% and more:
+    without what arrives by mirrors and glass, or without what they send from surface to surface, it is less.
+    """
+    scene, lighting = build(0.25, **objects(1.0)), prt.CubemapLighting(8)
+    transport = prt.precompute(scene, lighting, "gather", basis=basis, max_depth=-1, progress=False)
+    light = np.ones((lighting.n_directions, 3), np.float32)
+    irradiance = transport.irradiance(light).mean(axis=1)
+    specular = transport.operators["specular"].relight(light).mean(axis=1)
+    for mesh in scene.meshes:
+        if scene.albedo[mesh.vertices].any():
+            mean, part = (float(x[mesh.vertices].mean()) for x in (irradiance, specular))
+            print(f"{mesh.name}: {mean:.4f}, of which {part:.4f} by way of mirrors and glass")
+            assert mean == pytest.approx(1, abs=0.01)
+    assert specular[scene.meshes[0].vertices].mean() > 0.05
+
+
+def test_gathered_light_is_that_of_paths():
+    """Expected: of every mesh, the mean under each of six lights as paths find it, within 4 standard errors and 2%."""
+    shapes = {name: shape for name, shape in objects(0.6).items() if name not in ("cut", "air")}
+    scene, lighting = build(0.2, **shapes), prt.CubemapLighting(1)
+    problem = replace(problem_at(scene, lighting, basis="texel", max_depth=-1), specular_apart=True)
+    ids = np.arange(scene.n_vertices)
+    place = np.repeat(ids, 6), np.tile(np.arange(6), len(ids))
+    seen = DirectSolver(problem, 4).elements(*place).reshape(-1, 6)
+    arriving = specular_light(problem, 3, SpecularOptions(8, 8, strata=16)).operator.rows(ids).mean(axis=2)
+    bounced = RadiositySolver(problem, 1024).apply(seen + arriving).mean(axis=2)
+    paths = PathSolver(replace(problem, specular_apart=False), 1024).rows(ids)
+    power = lighting.solid_angles
+    known, variance = paths.mean.mean(axis=2) * power, paths.variance.mean(axis=2) * power**2
+    for mesh in scene.meshes:
+        part = mesh.vertices
+        ours, theirs = ((arriving + bounced)[part].mean(axis=0), known[part].mean(axis=0))
+        error = np.sqrt(variance[part].sum(axis=0)) / (part.stop - part.start)
+        print(mesh.name, np.round(ours, 4), np.round(theirs, 4), np.round((ours - theirs) / error, 1))
+        assert (np.abs(ours - theirs) < 4 * error + 0.02 * theirs.mean()).all()
+
+
+def test_noise_is_told():
+    """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
+    scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
+    problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
+    ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
+    exact = specular_light(problem, 9, SpecularOptions(8, 8)).operator.rows(ids) * power
+    noises = []
+    for strata in (1, 2):
+        found = specular_light(problem, 4, SpecularOptions(strata, strata))
+        true = np.linalg.norm(found.operator.rows(ids) * power - exact) / np.linalg.norm(exact)
+        print(f"{strata}: told {found.noise:.3f}, true {true:.3f}, {found.rays} rays")
+        assert found.noise == pytest.approx(true, rel=0.2)
+        noises.append(true)
+    assert noises[1] < 0.5 * noises[0]
+
+
+def test_each_surface_on_the_way_counts():
+    """A floor in a box of air is black at max_depth 2, and lit at 3: light crosses one wall of the box."""
+    shapes = {
+        "floor": {**FLOOR, "bsdf": diffuse(0.5, 0.5, 0.5)},
+        "air": {"type": "cube", "to_world": T().scale(2), "bsdf": {"type": "null"}},
+    }
+    scene, lighting = build(1.0, **shapes), prt.CubemapLighting(4)
+    floor = scene.meshes[0].vertices
+    lit = [
+        prt.precompute(scene, lighting, "gather", max_depth=depth, progress=False).relight(np.ones((96, 3)))[
+            floor
+        ]
+        for depth in (2, 3)
+    ]
+    assert not lit[0].any()
+    assert lit[1] == pytest.approx(0.5, abs=0.02)
+
+
+def test_light_falls_through_holes():
+    """Expected: a cut-out card over a floor is in the way where its texture says so, and a pane takes its share."""
+    card = {"type": "rectangle", "to_world": T().translate([0, 0.5, 0]).rotate([1, 0, 0], -90)}
+    up = np.argmax(prt.CubemapLighting(1).directions[:, 1])
+    for bsdf, share in (
+        ({"type": "mask", "opacity": CHECKERS, "bsdf": twosided(diffuse(0.5, 0.5, 0.5))}, None),
+        ({"type": "mask", "opacity": 0.25, "bsdf": twosided(diffuse(0.5, 0.5, 0.5))}, 0.75),
+    ):
+        scene = build(0.15, floor={**FLOOR, "bsdf": diffuse(1, 1, 1)}, card={**card, "bsdf": bsdf})
+        transport = prt.precompute(scene, prt.CubemapLighting(1), "gather", max_depth=3, progress=False)
+        floor = scene.meshes[0].vertices
+        x, _, z = scene.positions[floor].T
+        below = (np.abs(x) < 0.97) & (np.abs(z) < 0.97)
+        straight = (
+            transport.operators["direct"].columns([up])
+            + transport.operators["specular"].columns([up]).mean(axis=2, keepdims=True)
+        )[floor, 0, 0]
+        whole = straight.max()
+        assert straight[~below & (np.maximum(np.abs(x), np.abs(z)) > 1.03)] == pytest.approx(whole)
+        if share is not None:
+            assert straight[below] == pytest.approx(share * whole, rel=1e-3)
+            continue
+        u, v = (x + 1) / 2 * 2, (1 - z) / 2 * 2  # of the texture, twice over the card
+        away = (np.abs(u * 2 - np.round(u * 2)) > 0.05) & (np.abs(v * 2 - np.round(v * 2)) > 0.05) & below
+        opaque = (u % 1 > 0.5) != (v % 1 > 0.5)
+        one, other = straight[away & opaque], straight[away & ~opaque]
+        assert len(one) > 20
+        assert len(other) > 20
+        assert {0.0, float(whole)} == {float(np.round(one.max(), 6)), float(np.round(other.max(), 6))} or (
+            np.ptp(one) < 1e-5
+            and np.ptp(other) < 1e-5
+            and abs(one.mean() - other.mean()) == pytest.approx(whole)
+        )
+
+
+def test_the_operator_is_kept(tmp_path):
+    """Through files, compression and other orders of shapes; the same seed gives the same bits."""
+    scene, lighting = build(0.5, **objects(0.6)), prt.CubemapLighting(4)
+    transport = prt.precompute(scene, lighting, "gather", progress=False)
+    again = prt.precompute(scene, lighting, "gather", progress=False)
+    for name, operator in transport.operators.items():
+        assert np.array_equal(again.operators[name].rows(IDS), operator.rows(IDS))
+    transport.save(tmp_path / "specular.prt")
+    loaded = prt.load_transport(tmp_path / "specular.prt", scene)
+    light = np.random.default_rng(0).random((lighting.n_directions, 3)).astype(np.float32)
+    assert np.array_equal(loaded.relight(light), transport.relight(light))
+    assert transport.report["rays"]["specular"] > 0
+    compressed = prt.compress(transport, clusters=4, bases=24, progress=False)
+    ours, exact = compressed.relight(light), transport.relight(light)
+    assert np.linalg.norm(ours - exact) < 0.1 * np.linalg.norm(exact)
