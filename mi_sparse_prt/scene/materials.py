@@ -35,6 +35,11 @@ def bsdf_class(bsdf: mi.BSDF) -> str:
     return own if own != "BSDF" else str(bsdf.class_name())
 
 
+def printed(thing: mi.Object) -> str:
+    """An object as Mitsuba prints it, without addresses of Python plugins."""
+    return re.sub(r" at 0x[0-9a-f]+", "", str(thing))
+
+
 class Material:
     """A shape's BSDF, and what can be said about it.
 
@@ -55,7 +60,7 @@ class Material:
         self.name = name
         self.bsdf: mi.BSDF = shape.bsdf()
         self._emitter = shape.emitter() if shape.is_emitter() else None
-        self._text = re.sub(r" at 0x[0-9a-f]+", "", str(self.bsdf))  # no addresses of Python plugins
+        self._text = printed(self.bsdf)
         # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
         self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
         flags = int(self.bsdf.flags())
@@ -82,12 +87,16 @@ class Material:
             )
 
     def emission(self) -> mi.Emitter | None:
-        """A copy of the shape's area emitter for another shape; None if it has none or a textured one."""
-        if self._emitter is None:
+        """A copy of the shape's area emitter for another shape, with the same texture if it has one; None without.
+
+        Other emitters of shapes (``directionalarea``) are found by no path from a camera, and are left out.
+        """
+        if self._emitter is None or self._emitter.class_name() != "AreaLight":
             return None
         values = mi.traverse(self._emitter)
         if "radiance.value" not in values:
-            return None
+            texture = next(node for node, (_, depth) in values.hierarchy.items() if depth == 1)
+            return mi.load_dict({"type": "area", "radiance": texture})
         radiance = np.ravel(values["radiance.value"]).astype(float)
         spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
         return mi.load_dict({"type": "area", "radiance": spectrum})
@@ -152,18 +161,22 @@ class Material:
         return all(_has_equal_channels(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
-        """SHA-256 of the BSDF's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
-        state = hashlib.sha256(self._text.encode())
-        parameters = mi.traverse(self.bsdf)
-        for name in sorted(parameters.keys()):
-            value = parameters[name]
-            state.update(name.encode())
-            state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
-            texture = next((of for of in parameters.properties[name] if isinstance(of, mi.Texture)), None)
-            if name.endswith("data") and texture is not None and value.ndim == 3:
-                found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
-                state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
-        return state.digest()
+        """SHA-256 of the BSDF, see ``digest``."""
+        return digest(self._text, mi.traverse(self.bsdf))
+
+
+def digest(text: str, parameters: mi.SceneParameters, left_out: tuple[str, ...] = ()) -> bytes:
+    """SHA-256 of an object's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
+    state = hashlib.sha256(text.encode())
+    for name in sorted(set(parameters.keys()) - set(left_out)):
+        value = parameters[name]
+        state.update(name.encode())
+        state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
+        texture = next((of for of in parameters.properties[name] if isinstance(of, mi.Texture)), None)
+        if name.endswith("data") and texture is not None and value.ndim == 3:
+            found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
+            state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
+    return state.digest()
 
 
 def _lookup(texture: mi.Texture, data: mi.TensorXf, to_uv: mi.ScalarTransform3f) -> tuple[str, str]:

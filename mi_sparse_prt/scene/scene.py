@@ -62,8 +62,7 @@ class Scene:
     meshes : tuple of Mesh
     mitsuba : mi.Scene
         World space: the meshes of `meshes`, in that order and with these vertices, plus the sensors, emitters
-        and integrator of the original scene (the same objects; area emitters of one colour are copied, textured
-        ones left out).
+        and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
     normalised : mi.Scene
         The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
         no sensors.

@@ -128,7 +128,7 @@ def test_a_column_is_the_scene_with_one_lamp(scene, transport, name):
     lit = "lamp" if name == "panel" else name
     alone = prt.Scene.from_mitsuba(room((lit,)), 0.12)
     x, y = rendered_at_vertices(alone)
-    column = transport.columns([transport.emission.names.index(name)])[:, 0]
+    column = transport.columns([transport.lights.index(name)])[:, 0]
     assert np.allclose(column, transport.relight({name: 1.0}), atol=1e-6 * column.max())
     assert column.mean() == pytest.approx((x.mean() + y.mean()) / 2, rel=0.01)
     assert relative_l2_without_noise(column, x, y)[0] < 0.05
