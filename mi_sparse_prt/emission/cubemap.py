@@ -219,7 +219,7 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
     coarse = max(16, -(-384 // n))
     radiance, peaks = _sampled(emitter, texels, n, coarse)
     sharp = np.flatnonzero(peaks > 2 * radiance.max(axis=1))
-    radiance[sharp] = _sampled(emitter, sharp, n, 8 * coarse)[0]
+    radiance[sharp] = _sampled(emitter, sharp, n, 16 * coarse)[0]
     return radiance.astype(np.float32)
 
 

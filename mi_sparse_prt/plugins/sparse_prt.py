@@ -64,7 +64,7 @@ class SparsePRT(mi.SamplingIntegrator):
     Parameter           Type       Meaning
     =================== ========== =============================================================================
     resolution          integer    Texels along an edge of the lighting's cubemap, a power of two. (32)
-    method              string     As for ``prt.precompute``; lamps take ``auto`` where it knows none. (auto)
+    method              string     As for ``prt.precompute``; for lamps all but ``brute_force`` mean ``auto``. (auto)
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
     precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16)
@@ -156,9 +156,9 @@ class SparsePRT(mi.SamplingIntegrator):
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (n_v, 3) of light of lamps that was reflected at least once before."""
-        lamps, method = UnitLamps(surfaces), self._settings["method"]
+        lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
         settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed")}
-        settings["method"] = method if method in ("gather", "brute_force") else "auto"
+        settings["method"] = "brute_force" if by_paths else "auto"
         transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)
         return transport.operators["indirect"].relight(lamps.brightness)
 

@@ -47,8 +47,12 @@ class LampLitIntegrator(RelitIntegrator):
 
 def without_environment(scene: mi.Scene) -> mi.Scene:
     """A scene of the same shapes and emitters but the environment."""
-    shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.shapes())}
     on_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
-    others = [e for e in scene.emitters() if not e.is_environment() and not any(e is s for s in on_shapes)]
-    lamps = {f"lamp_{k}": emitter for k, emitter in enumerate(others)}
-    return mi.load_dict({**watertight_scene(), **shapes, **lamps}, optimize=False)
+    free = [e for e in scene.emitters() if not e.is_environment() and not any(e is s for s in on_shapes)]
+    kept = [*scene.shapes(), *free]
+    names = [thing.id() for thing in kept]
+    content = {f"kept_{k}": thing for k, thing in enumerate(kept)}
+    result = mi.load_dict({**watertight_scene(), **content}, optimize=False)
+    for thing, name in zip(kept, names, strict=True):
+        thing.set_id(name)  # they were given the names of this dictionary
+    return result
