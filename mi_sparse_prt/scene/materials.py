@@ -53,7 +53,7 @@ class Material:
     one_sided : bool
         It is black from behind.
     constant : bool
-        It certainly does not vary over the surface nor with its rotation.
+        It certainly does not vary over the surface nor with its rotation, and neither does the shape's own light.
     """
 
     def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
@@ -69,7 +69,9 @@ class Material:
         bumped = bool(self._classes & BUMPED)
         self._lambertian = scatter == int(mi.BSDFFlags.DiffuseReflection)
         self.diffuse = self._lambertian and not bumped
-        self.constant = self._classes <= PLAIN
+        self._radiance = None if self._emitter is None else _radiance(self._emitter)
+        textured = self._radiance is not None and self._radiance.is_spatially_varying()
+        self.constant = self._classes <= PLAIN and not textured
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
@@ -91,12 +93,11 @@ class Material:
 
         Other emitters of shapes (``directionalarea``) are found by no path from a camera, and are left out.
         """
-        if self._emitter is None or self._emitter.class_name() != "AreaLight":
+        if self._radiance is None:
             return None
         values = mi.traverse(self._emitter)
         if "radiance.value" not in values:
-            texture = next(node for node, (_, depth) in values.hierarchy.items() if depth == 1)
-            return mi.load_dict({"type": "area", "radiance": texture})
+            return mi.load_dict({"type": "area", "radiance": self._radiance})
         radiance = np.ravel(values["radiance.value"]).astype(float)
         spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
         return mi.load_dict({"type": "area", "radiance": spectrum})
@@ -177,6 +178,13 @@ def digest(text: str, parameters: mi.SceneParameters, left_out: tuple[str, ...] 
             found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
             state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
     return state.digest()
+
+
+def _radiance(emitter: mi.Emitter) -> mi.Texture | None:
+    """The texture, of one colour or more, that an area light shines with; None of emitters of other kinds."""
+    if emitter.class_name() != "AreaLight":
+        return None
+    return next(node for node, (_, depth) in mi.traverse(emitter).hierarchy.items() if depth == 1)
 
 
 def _lookup(texture: mi.Texture, data: mi.TensorXf, to_uv: mi.ScalarTransform3f) -> tuple[str, str]:
