@@ -17,7 +17,7 @@ def rgb(*values: float) -> dict:
     return {"type": "rgb", "value": list(values)}
 
 
-def lamps(screen: float = 1.0, turned: float = 0.0, **changes: object) -> UnitLamps:
+def room(screen: float = 1.0, turned: float = 0.0, **changes: object) -> prt.Scene:
     """A panel, a screen, a bulb, a spot and a sky over a floor, some of them changed."""
     pixels = mi.TensorXf(screen * np.arange(1, 13, dtype=np.float32).reshape(2, 2, 3))
     texture = {"type": "bitmap", "data": pixels, "raw": True, "to_uv": mi.ScalarTransform3f().rotate(turned)}
@@ -45,17 +45,20 @@ def lamps(screen: float = 1.0, turned: float = 0.0, **changes: object) -> UnitLa
         content[name] = content[name] | change
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", prt.PrtWarning)
-        return UnitLamps(
-            prt.Scene.from_mitsuba(mi.load_dict({"type": "scene", **content}, optimize=False), 1)
-        )
+        return prt.Scene.from_mitsuba(mi.load_dict({"type": "scene", **content}, optimize=False), 1)
 
 
-def arriving(space: UnitLamps) -> np.ndarray:
-    """(size, 3) light of each lamp at a point of the floor, at right angles, from one sample."""
-    count = space.size
-    element = mi.UInt32(np.arange(count, dtype=np.uint32))
-    position, uv = mi.Point3f(np.tile([[0.1], [0], [0.2]], count)), mi.Point2f(np.full((2, count), 0.3))
-    return space.sample(element, position, uv)[1].numpy().T
+def lamps(**changes: object) -> UnitLamps:
+    return UnitLamps(room(**changes))
+
+
+def arriving(space: prt.SceneEmitters, samples: int = 1 << 12) -> np.ndarray:
+    """(size, 3) light of each lamp at a point above the floor, at right angles to it."""
+    element = mi.UInt32(np.repeat(np.arange(space.size, dtype=np.uint32), samples))
+    uv = np.random.default_rng(0).random((2, len(element))).astype(np.float32)
+    position = mi.Point3f(np.tile([[0.1], [0.2], [0.2]], len(element)))
+    found = space.sample(element, position, mi.Point2f(uv))[1].numpy()
+    return found.reshape(3, space.size, samples).mean(axis=2, dtype=np.float64).T
 
 
 def test_columns_times_brightness_are_the_lamps():
@@ -112,3 +115,27 @@ def test_another_surface_that_shines_is_another_hash():
 
     assert space("a").scene_hash == space("b").scene_hash
     assert space("a").hash != space("b").hash
+
+
+def test_textured_lamps_are_dimmed_and_coloured():
+    scene = room()
+    space = prt.SceneEmitters(scene, {"screen": ["screen"]})
+    before = arriving(space)
+    for brightness, noise in (([0.5, 0.5, 0.5], 1e-4), ([2, 0, 0.25], 0.02)):  # samples go where it is bright
+        with space.scene_lit_by({"screen": brightness}, scene):
+            np.testing.assert_allclose(arriving(space), before * brightness, rtol=noise)
+    assert np.array_equal(arriving(space), before)
+
+
+def test_what_takes_no_colour_is_refused_by_name():
+    scene = room()
+    space = prt.SceneEmitters(scene, {"sky": ["sky"]})
+    with (
+        pytest.raises(prt.PrtError, match="'sky' .* takes no colour"),
+        space.scene_lit_by([[1, 2, 3]], scene),
+    ):
+        pass
+    with space.scene_lit_by(0.5, scene):
+        assert mi.traverse(scene.mitsuba)["sky.radiance.value"] == 0.5
+    with pytest.raises(prt.PrtError, match="no lamp besides its environment"):
+        UnitLamps(prt.Scene.from_mitsuba(mi.load_dict({"type": "scene", "a": {"type": "sphere"}}), 1))
