@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import mitsuba as mi
 
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
-from mi_sparse_prt.scene.mitsuba_meshes import watertight_scene
+from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 
 
 class LampLitIntegrator(RelitIntegrator):
@@ -49,10 +49,4 @@ def without_environment(scene: mi.Scene) -> mi.Scene:
     """A scene of the same shapes and emitters but the environment."""
     on_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
     free = [e for e in scene.emitters() if not e.is_environment() and not any(e is s for s in on_shapes)]
-    kept = [*scene.shapes(), *free]
-    names = [thing.id() for thing in kept]
-    content = {f"kept_{k}": thing for k, thing in enumerate(kept)}
-    result = mi.load_dict({**watertight_scene(), **content}, optimize=False)
-    for thing, name in zip(kept, names, strict=True):
-        thing.set_id(name)  # they were given the names of this dictionary
-    return result
+    return scene_of({f"kept_{k}": thing for k, thing in enumerate([*scene.shapes(), *free])})
