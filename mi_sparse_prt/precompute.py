@@ -407,6 +407,13 @@ def _inputs(problem: Problem, settings: Settings) -> dict[str, Any]:
 def _account(parts: MethodResult, problem: Problem, skipped: list[str]) -> dict[str, Any]:
     """What was evaluated and what was not, for the report."""
     skipped = [*skipped, *parts.skipped]
+    if problem.scene.dark_backs:
+        names = ", ".join(problem.scene.dark_backs[:5]) + (
+            ", ..." if len(problem.scene.dark_backs) > 5 else ""
+        )
+        skipped.append(
+            f"backs that no light reaches, of {len(problem.scene.dark_backs)} two-sided shapes: {names}"
+        )
     if isinstance(problem.emission, CubemapLighting):
         above = share_above_horizon(problem.points, problem.emission)
         skipped.append(f"direct rays below the horizon: {1 - above:.0%} of the elements")

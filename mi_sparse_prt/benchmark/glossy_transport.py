@@ -137,11 +137,11 @@ def _environments(scene: Scene) -> dict[str, Environment | mi.Emitter]:
 def diffuse_copy(scene: Scene) -> Scene:
     """The same vertices, with diffuse surfaces of the same albedo where they are glossy."""
     shapes = {}
-    for mesh, shape, material in zip(scene.meshes, scene.unlit_shapes(), scene.materials, strict=True):
+    for mesh, shape, material in zip(scene.fronts, scene.unlit_shapes(), scene.materials, strict=False):
         if not material.diffuse:
             albedo = scene.albedo[mesh.vertices].mean(axis=0).astype(float).tolist()
             bsdf = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}})
-            shape = with_bsdf(shape, bsdf)
+            shape = with_bsdf(shape, bsdf, material.two_sided)
         shapes[mesh.name] = shape
     return Scene.from_mitsuba(mi.load_dict({"type": "scene", **shapes}, optimize=False), float("inf"))
 

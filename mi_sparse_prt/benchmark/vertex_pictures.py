@@ -94,7 +94,7 @@ class _Hits:
     """
 
     def __init__(self, scene: Scene, ray: mi.RayDifferential3f, film_pixels: float) -> None:
-        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         hit = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(ray))
         si = hit.compute_surface_interaction(mi.Ray3f(ray))
         self.valid = hit.is_valid().numpy()

@@ -284,7 +284,7 @@ def emitter_names(scene: Scene) -> dict[str, int]:
     on_shapes = meshes_of_emitters(scene)
     names: dict[str, int] = {}
     for k, emitter in enumerate(scene.mitsuba.emitters()):
-        name = scene.meshes[on_shapes[k]].name if k in on_shapes else emitter.id()
+        name = scene.fronts[on_shapes[k]].name if k in on_shapes else emitter.id()
         if not name or name.startswith("_"):  # Mitsuba's and ours for what has no name
             name = f"{emitter.class_name().lower()}_{k}"
         names[name if name not in names else f"{name}_{k}"] = k

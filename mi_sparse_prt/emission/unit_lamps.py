@@ -99,7 +99,7 @@ def _brightness(emitter: mi.Emitter) -> NDArray[np.float32]:
 
 def _surface(scene: Scene, mesh: int) -> bytes:
     """Which of the surfaces shines, and how its texture lies on it, whatever the order of its vertices."""
-    keys, shape = scene.vertex_keys[scene.meshes[mesh].vertices], scene.mitsuba.shapes()[mesh]
+    keys, shape = scene.vertex_keys[scene.fronts[mesh].vertices], scene.mitsuba.shapes()[mesh]
     if shape.has_vertex_texcoords():
         keys = hash_rows(np.array(shape.vertex_texcoords_buffer(), np.float32).reshape(-1, 2), keys)
     return np.sort(keys).tobytes()

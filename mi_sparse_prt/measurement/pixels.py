@@ -30,8 +30,8 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     Returns
     -------
     Measurement
-        Outputs are pixels, row by row; ``image`` is (height, width). Points are those whose fronts are seen; the share
-        of a pixel that other samples have is missing in its weights.
+        Outputs are pixels, row by row; ``image`` is (height, width). Points are on sheets of surfaces that reflect;
+        the share of a pixel that other samples have is missing in its weights.
 
     Raises
     ------
@@ -42,10 +42,10 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
     places = _jittered(width, height, spp, seed)
-    si, front = _seen(scene.mitsuba, sensor, places, (width, height))
-    kept = np.flatnonzero(front)
+    si, reflects = _seen(scene.mitsuba, sensor, places, (width, height))
+    kept = np.flatnonzero(reflects)
     if not len(kept):
-        raise PrtError("the camera sees no front of a surface; move it, or choose another sensor")
+        raise PrtError("the camera sees no surface that reflects; move it, or choose another sensor")
     here = mi.UInt32(kept.astype(np.uint32))
     points, albedo = _surface_points(scene, dr.gather(mi.SurfaceInteraction3f, si, here))
     weights = _filter_weights(film.rfilter(), places, width, height)[:, kept]
@@ -77,18 +77,20 @@ def _jittered(width: int, height: int, spp: int, seed: int) -> NDArray[np.float3
 def _seen(
     scene: mi.Scene, sensor: mi.Sensor, places: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[mi.SurfaceInteraction3f, NDArray[np.bool_]]:
-    """What camera rays meet, and which of them meet the front of a surface."""
+    """What camera rays meet, and which of them meet the front of a surface, or a back that reflects as well."""
     at = mi.Point2f(*(np.ascontiguousarray(places[:, k] / size[k]) for k in range(2)))
     ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), at, mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
-    return si, (si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)).numpy()
+    two_sided = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
+    return si, (si.is_valid() & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0))).numpy()
 
 
 def _surface_points(scene: Scene, si: mi.SurfaceInteraction3f) -> tuple[Points, NDArray[np.float32]]:
     """Points in the normalised frame, and their albedo (n, 3), with textures at full resolution."""
     positions = ((np.array(si.p).T.astype(np.float64) - scene.centre) * scene.scale).astype(np.float32)
-    normals = np.array(mi.Normal3f(si.sh_frame.n)).T.astype(np.float32)
-    geometric = np.array(si.n).T.astype(np.float32)
+    side = dr.sign(mi.Frame3f.cos_theta(si.wi))
+    normals = np.array(mi.Normal3f(si.sh_frame.n * side)).T.astype(np.float32)
+    geometric = np.array(si.n * side).T.astype(np.float32)
     albedo = np.array(mi.Color3f(si.bsdf().eval_diffuse_reflectance(si))).T.astype(np.float32)
     keys = hash_rows(positions, hash_rows(normals))
     points = Points(positions, np.ascontiguousarray(normals), np.ascontiguousarray(geometric), keys)

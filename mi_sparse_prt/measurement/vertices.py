@@ -54,8 +54,7 @@ def vertex_points(scene: Scene) -> Points:
 
 
 def _vertex_points(scene: Scene) -> Points:
-    positions = scene.normalised_positions
-    triangles = np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
+    positions, triangles = scene.normalised_positions, _triangles(scene)
     border, centre = _centres_beside_border(positions, triangles)
     inwards = centre - positions[border]  # [border vertex, xyz]
     length = np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-30)
@@ -65,6 +64,11 @@ def _vertex_points(scene: Scene) -> Points:
     moved[border] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
     # two vertices may differ only in the side to which they moved: where two meshes meet
     return Points(moved, scene.normals, scene.normals, hash_rows(moved, scene.vertex_keys))
+
+
+def _triangles(scene: Scene) -> NDArray[np.int64]:
+    """Of all sheets, by the numbers of the scene's vertices."""
+    return np.concatenate([m.triangles.astype(np.int64) + m.vertices.start for m in scene.meshes])
 
 
 def _centres_beside_border(
@@ -128,13 +132,15 @@ class VertexRays:
         return VertexRays(self.origins[vertices], self.directions[vertices], self.missed[vertices])
 
 
-def vertex_rays(scene: mi.Scene) -> VertexRays:
+def vertex_rays(scene: mi.Scene, sheets: Scene | None = None) -> VertexRays:
     """Find for every mesh vertex of a Mitsuba scene a ray that hits the surface next to it.
 
     Parameters
     ----------
     scene : mi.Scene
         All its shapes are meshes; vertices are counted in the order of the shapes.
+    sheets : Scene, optional
+        Whose shapes these are: vertices on the backs of two-sided surfaces follow, seen from there.
 
     Notes
     -----
@@ -147,6 +153,8 @@ def vertex_rays(scene: mi.Scene) -> VertexRays:
     # vertices that the first ones miss (slivers, surfaces in contact).
     approaches = ((1e-2, 2e-4), (3e-2, 1e-4), (1e-1, 3e-5), (3e-2, 1e-3))
     vertices, triangles = _merge(scene)
+    if sheets is not None:
+        vertices, triangles = vertices[sheets.front_of], _triangles(sheets)
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     owners, rank, corners = _triangles_of_vertices(vertices, triangles)
     origins = np.zeros_like(vertices)
@@ -219,10 +227,13 @@ def sensor_points(scene: Scene, rays: VertexRays | None = None) -> Points:
     rays : VertexRays, optional
         Of ``scene.normalised``; made here if not given.
     """
-    rays = rays or vertex_rays(scene.normalised)
+    rays = rays or vertex_rays(scene.normalised, scene)
     ray = mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
     si = scene.normalised.ray_intersect(ray)
     dr.eval(si)
-    as_rows = [np.ascontiguousarray(a.numpy().T) for a in (si.p, si.sh_frame.n, si.n)]
+    p, normals, geometric = (np.ascontiguousarray(a.numpy().T) for a in (si.p, si.sh_frame.n, si.n))
+    backs = scene.front_of != np.arange(scene.n_vertices)
+    normals[backs] *= -1
+    geometric[backs] *= -1
     # the random numbers of the vertices: what differs between the two is then due to the points alone
-    return Points(as_rows[0], as_rows[1], as_rows[2], vertex_points(scene).keys)
+    return Points(p, normals, geometric, vertex_points(scene).keys)

@@ -12,7 +12,6 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
@@ -163,10 +162,7 @@ def gather_costs(
     if not scene.diffuse:
         return None
     pilot, seeds = _Pilot(direct, held.vertices), element_seeds(stream, 2)
-    try:
-        few, many = ([pilot.rays(count, k) for k in seeds] for count in (FEW, MANY))
-    except PrtError:  # too many backs of surfaces are in sight
-        return None
+    few, many = ([pilot.rays(count, k) for k in seeds] for count in (FEW, MANY))
     light = [[pilot.light(rays, held.texels) for rays in pair] for pair in (few, many)]
     noise = [held.relative_square(held.weighted((a - b) ** 2 / 2)) for a, b in light]
     first = held.paths(3, PATHS)

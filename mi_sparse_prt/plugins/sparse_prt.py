@@ -138,21 +138,24 @@ class SparsePRT(mi.SamplingIntegrator):
             )
         surfaces = _read(scene, self._edge_length)
         relit = self._relit(surfaces, scene.environment(), lamps)
-        integrator = LampLitIntegrator(relit, scene) if lamps else RelitIntegrator(relit[0])
+        depth = self._settings["max_depth"]
+        integrator = LampLitIntegrator(relit, scene, depth) if lamps else RelitIntegrator(relit[0])
         return integrator.render(scene, sensor, seed, spp, develop, evaluate)
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:
         """All light but that which lamps send to the camera directly or after one reflection."""
         irradiance = np.zeros((surfaces.n_vertices, 3), np.float32)
-        if lamps and self._settings["max_depth"] != 2:
+        depth = self._settings["max_depth"]
+        if lamps and depth != 2:
             irradiance += self._light_of_lamps(surfaces)
         if environment is None:
-            return [RelitScene(surfaces, irradiance, None)]
+            return [RelitScene(surfaces, irradiance, None, max_depth=depth)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         if not transport.terms:
-            return [RelitScene(surfaces, irradiance + transport.irradiance(environment), environment)]
+            irradiance += transport.irradiance(environment)
+            return [RelitScene(surfaces, irradiance, environment, max_depth=depth)]
         relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment)]
-        return [*relit, RelitScene(surfaces, irradiance, None)] if lamps else relit
+        return [*relit, RelitScene(surfaces, irradiance, None, max_depth=depth)] if lamps else relit
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (n_v, 3) of light of lamps that was reflected at least once before."""

@@ -15,7 +15,7 @@ Doubles = NDArray[np.float64]
 
 def beside_vertices(scene: Scene) -> mi.SurfaceInteraction3f:
     """The surface next to each vertex, in one of the triangles around it, as Mitsuba sees it (normalised frame)."""
-    rays = vertex_rays(scene.normalised)
+    rays = vertex_rays(scene.normalised, scene)
     return scene.normalised.ray_intersect(
         mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
     )
@@ -42,9 +42,9 @@ def vertex_tangents(scene: Scene) -> Floats:
     """
     found = [
         _mean_axes(shape, mesh, scene.normals[mesh.vertices].astype(np.float64))
-        for shape, mesh in zip(scene.mitsuba.shapes(), scene.meshes, strict=True)
+        for shape, mesh in zip(scene.mitsuba.shapes(), scene.fronts, strict=True)
     ]
-    return orthogonalise(np.concatenate(found).astype(np.float32), scene.normals)
+    return orthogonalise(np.concatenate(found).astype(np.float32)[scene.front_of], scene.normals)
 
 
 def triangle_tangents(shape: mi.Mesh, triangles: NDArray[np.integer]) -> Doubles:

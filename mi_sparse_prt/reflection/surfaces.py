@@ -49,10 +49,11 @@ def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None
     material, known = np.full(scene.n_vertices, -1), dict[bytes, int]()
     factors: list[BrdfFactors] = []
     albedo, surface = scene.albedo.copy(), beside_vertices(scene)
-    for mesh, own, shape in zip(scene.meshes, scene.materials, scene.mitsuba.shapes(), strict=True):
+    shapes = scene.mitsuba.shapes()
+    for mesh, own in zip(scene.meshes, scene.materials, strict=True):
         if own.diffuse:
             continue
-        if not shape.has_vertex_texcoords() and is_anisotropic(own.bsdf, mesh.name):
+        if not shapes[mesh.shape].has_vertex_texcoords() and is_anisotropic(own.bsdf, mesh.name):
             warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=3)
         digest = own.digest()
         if digest not in known:

@@ -1,7 +1,12 @@
-"""R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4)."""
+"""R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4).
+
+Rays go on through mirrors, glass and masks, by Mitsuba's own samples of what these scatter into single directions,
+until they meet no more of it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -23,6 +28,7 @@ from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart
+MOST_MIRRORS = 64  # that a ray meets, where ``max_depth`` sets no limit
 
 Corner = tuple[
     Any, Any
@@ -41,10 +47,9 @@ class RelitScene:
         What rays see that leave the scene.
     lamps : (SampledEmission, (size, 3) float32), optional
         Light of the scene that is seen itself, and how bright they are.
-
-    Notes
-    -----
-    Only the side of a surface that its normals point to has light; the other side is black.
+    max_depth : int
+        As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts. That light of the vertices has
+        made fewer bounces then is left out of account.
     """
 
     def __init__(
@@ -53,46 +58,132 @@ class RelitScene:
         irradiance: NDArray[np.float32],
         background: mi.Emitter | None,
         lamps: tuple[SampledEmission, NDArray[np.float32]] | None = None,
+        max_depth: int = -1,
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
+        self._most = max_depth if 0 <= max_depth < MOST_MIRRORS else MOST_MIRRORS
+        self._goes_on = any(material.single_directions for material in scene.materials)
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
-        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
+        self._backs = mi.Int32(scene.backs.astype(np.int32))
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
 
-    def radiance(self, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+    def radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
+        if self._goes_on:
+            return follow_single_directions(self._seen, ray, sampler, active, self._most)
+        value, si = self._met(ray, mi.Point2f(0.5), active, active)
+        return value, active & si.is_valid()
+
+    def _seen(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, depth: mi.UInt32, last: mi.Mask, active: mi.Mask
+    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
+        """See ``follow_single_directions``."""
+        u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
+        return self._met(ray, u, active, active & ~last)
+
+    def _met(
+        self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask
+    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
+        """Radiance of what rays meet, which is that of surfaces only where these are asked for, and what that is."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
-        valid = active & si.is_valid()
-        front = valid & (mi.Frame3f.cos_theta(si.wi) > 0)
-        value = dr.select(front, self._shaded(si, self._hit_corners(hit, valid), valid), 0)
+        valid = reflects & si.is_valid()
+        behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
+        corners, lit = self._hit_corners(hit, valid, behind)
+        value = dr.select(lit, self._shaded(si, corners, u, lit), 0)
         if self._background is not None:
             value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
-        return value, valid
+        return value, si
 
-    def _hit_corners(self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask) -> list[Corner]:
+    def _hit_corners(
+        self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask, behind: mi.Mask
+    ) -> tuple[list[Corner], mi.Mask]:
+        """The vertices around each hit, on the sheet that it is on, and whether that has any."""
         triangle = self._first_triangle.gather(hit.shape, valid) + hit.prim_index
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
-        return list(zip(vertices, (1 - u - v, u, v), strict=True))
+        backs = [dr.gather(mi.Int32, self._backs, vertex, behind) for vertex in vertices]
+        valid &= ~behind | (backs[0] >= 0)
+        vertices = [
+            dr.select(behind, mi.UInt32(back), vertex) for back, vertex in zip(backs, vertices, strict=True)
+        ]
+        return list(zip(vertices, (1 - u - v, u, v), strict=True)), valid
 
-    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
-        """Radiance that leaves the fronts of surfaces."""
+    def _shaded(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> mi.Color3f:
+        """Radiance that leaves surfaces, but for what they scatter into single directions."""
         irradiance, albedo = (
             interpolated(values, corners, valid) for values in (self._irradiance, self._albedo)
         )
         bsdf = si.bsdf()
-        diffuse = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~mi.has_flag(
-            bsdf.flags(), mi.BSDFFlags.Delta
+        flags = bsdf.flags()
+        diffuse = ~mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Delta)
+        reflected = dr.select(diffuse, bsdf.eval_diffuse_reflectance(si, valid), albedo)
+        if self._goes_on:
+            # a share of it is diffuse: what a random direction finds is that share, on average over all directions
+            shared = _scatters_into_single_directions(bsdf) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
+            out = mi.warp.square_to_cosine_hemisphere(u)
+            out.z = dr.mulsign(out.z, mi.Frame3f.cos_theta(si.wi))
+            value = bsdf.eval(mi.BSDFContext(), si, out, valid & shared)
+            reflected = dr.select(shared, value * dr.pi / dr.maximum(dr.abs(out.z), 1e-6), reflected)
+        return irradiance * reflected
+
+
+@dr.syntax
+def follow_single_directions(
+    seen: Callable[..., tuple[mi.Color3f, mi.SurfaceInteraction3f]],
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
+    most: int,
+) -> tuple[mi.Color3f, mi.Mask]:
+    """What rays see that go on through mirrors, glass and masks, and whether they meet any surface.
+
+    Parameters
+    ----------
+    seen : callable
+        Of a ray, the sampler, how many surfaces it met before, whether none may reflect after these, and whether it is
+        active: the radiance of what it meets, but for what that scatters into single directions, and what it meets.
+    ray : Ray3f, world
+    sampler : Sampler
+    active : Mask
+    most : int
+        Surfaces and the light after them, as ``max_depth``.
+    """
+    context = mi.BSDFContext()
+    context.type_mask = int(mi.BSDFFlags.Delta)
+    ray, active = mi.Ray3f(ray), mi.Mask(active)
+    total, throughput = mi.Color3f(0), mi.Color3f(1)
+    depth, valid = mi.UInt32(0), mi.Mask(False)
+    limit = dr.opaque(mi.UInt32, most)
+    active &= depth < limit
+    while active:
+        value, si = seen(ray, sampler, depth, depth + 1 >= limit, active)
+        total += dr.select(active, throughput * value, 0)
+        active &= si.is_valid()
+        valid |= active
+        bsdf = si.bsdf()
+        active &= _scatters_into_single_directions(bsdf)
+        sample, weight = bsdf.sample(
+            context, si, sampler.next_1d(active), mi.Point2f(sampler.next_2d(active)), active
         )
-        textured = bsdf.eval_diffuse_reflectance(si, valid)
-        return irradiance * dr.select(diffuse, textured, albedo)
+        throughput *= weight
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        depth += 1
+        active &= (depth < limit) & (dr.max(throughput) > 0)
+    return total, valid
+
+
+def _scatters_into_single_directions(bsdf: mi.BSDFPtr) -> mi.Mask:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # Null is among them
 
 
 def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
@@ -126,7 +217,7 @@ class GlossyRelitScene(RelitScene):
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients(environment), transport.reflection
         assert isinstance(surfaces, InOutFactors)
-        super().__init__(scene, found.unit_albedo, background)
+        super().__init__(scene, found.unit_albedo, background, max_depth=transport.max_depth)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
@@ -144,7 +235,9 @@ class GlossyRelitScene(RelitScene):
         }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
 
-    def _shaded(self, si: mi.SurfaceInteraction3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+    def _shaded(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> mi.Color3f:
         glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
         material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
         diffuse = interpolated(self._diffuse, corners, glossy)
@@ -154,13 +247,14 @@ class GlossyRelitScene(RelitScene):
         total = dr.select(
             glossy,
             interpolated(self._irradiance, corners, glossy) * diffuse,
-            super()._shaded(si, corners, valid),
+            super()._shaded(si, corners, u, valid),
         )
         towards = si.to_world(si.wi)
+        normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
         for vertex, weight in corners:
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
-            s = dr.normalize(tangent - si.sh_frame.n * dr.dot(si.sh_frame.n, tangent))
-            local = mi.Frame3f(s, dr.cross(si.sh_frame.n, s), si.sh_frame.n).to_local(towards)
+            s = dr.normalize(tangent - normal * dr.dot(normal, tangent))
+            local = mi.Frame3f(s, dr.cross(normal, s), normal).to_local(towards)
             lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
             for k, values in enumerate(self._terms):
                 coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
@@ -188,7 +282,7 @@ class RelitIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Mask = True,
     ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
-        value, valid = self._relit.radiance(mi.Ray3f(ray), mi.Mask(active))
+        value, valid = self._relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))
         return value, valid, []
 
 
@@ -255,7 +349,7 @@ def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> R
         return GlossyRelitScene(scene, transport, environment, background)
     dark = transport.measurement.kind != "vertices"
     irradiance = np.zeros((scene.n_vertices, 3), np.float32) if dark else transport.irradiance(environment)
-    return RelitScene(scene, irradiance, background, lamps)
+    return RelitScene(scene, irradiance, background, lamps, transport.max_depth)
 
 
 def _rendered(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -50,28 +51,21 @@ class Material:
     bsdf : mi.BSDF
     diffuse : bool
         It reflects diffusely and does nothing else.
-    one_sided : bool
-        It is black from behind.
+    two_sided : bool
+        It reflects light on its back, too, by more than a mirror's single direction.
+    passes_light : bool
+        Some light goes through it.
+    single_directions : bool
+        It scatters some light into single directions: a mirror, glass, a mask.
     constant : bool
         It certainly does not vary over the surface nor with its rotation, and neither does the shape's own light.
     """
 
     def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
         self.name = name
-        self.bsdf: mi.BSDF = shape.bsdf()
         self._emitter = shape.emitter() if shape.is_emitter() else None
-        self._text = printed(self.bsdf)
-        # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
-        self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
-        flags = int(self.bsdf.flags())
-        scatter = flags & int(mi.BSDFFlags.All)
-        self.one_sided = not flags & int(mi.BSDFFlags.BackSide)
-        bumped = bool(self._classes & BUMPED)
-        self._lambertian = scatter == int(mi.BSDFFlags.DiffuseReflection)
-        self.diffuse = self._lambertian and not bumped
         self._radiance = None if self._emitter is None else _radiance(self._emitter)
-        textured = self._radiance is not None and self._radiance.is_spatially_varying()
-        self.constant = self._classes <= PLAIN and not textured
+        self._set_bsdf(shape.bsdf(), 1)
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
@@ -87,6 +81,32 @@ class Material:
             notes.append(
                 f"shape '{name}' bounds a medium: media are left out, light passes as through a vacuum"
             )
+
+    def _set_bsdf(self, bsdf: mi.BSDF, side: int) -> None:
+        """Look at a BSDF from its front (1) or its back (-1)."""
+        self.bsdf, self._side = bsdf, side
+        self._text = printed(bsdf)
+        # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
+        self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
+        flags = int(bsdf.flags())
+        self._lambertian = flags & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.DiffuseReflection)
+        self.diffuse = self._lambertian and not self._classes & BUMPED
+        self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
+        self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
+        self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
+        textured = self._radiance is not None and self._radiance.is_spatially_varying()
+        self.constant = self._classes <= PLAIN and not textured
+
+    def back(self) -> Material:
+        """What the back of the shape is made of."""
+        behind = copy(self)
+        if self._text.startswith("TwoSided["):
+            nested = _Nested()
+            self.bsdf.traverse(nested)
+            behind._set_bsdf(nested.objects["brdf_1"], 1)
+        else:
+            behind._set_bsdf(self.bsdf, -1)
+        return behind
 
     def emission(self) -> mi.Emitter | None:
         """A copy of the shape's area emitter for another shape, with the same texture if it has one; None without.
@@ -123,7 +143,7 @@ class Material:
         ray = dr.zeros(mi.Ray3f, n)
         si = shape.compute_surface_interaction(ray, pi)
         si.t = mi.Float(1.0)
-        si.wi = mi.Vector3f(0, 0, 1)
+        si.wi = mi.Vector3f(0, 0, self._side)
         value = self.bsdf.eval_diffuse_reflectance(si) if self._lambertian else self._directional_albedo(si)
         albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
         bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
@@ -135,7 +155,7 @@ class Material:
         return np.ascontiguousarray(np.minimum(albedo, 1))
 
     def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
-        """The share of light from the normal's direction that is scattered: a mean of stratified samples."""
+        """The share of light from the normal's direction that is reflected, but for mirrors: a mean of samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
         n = 8  # strata per axis
@@ -144,8 +164,9 @@ class Material:
             lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n
             lobe, x, y = (dr.opaque(mi.Float, value) for value in (lobe, x, y))  # one kernel for all strata
             u = mi.Point2f(x, y)
-            _, weight = self.bsdf.sample(context, si, lobe, u)
-            total += mi.Color3f(weight)
+            sample, weight = self.bsdf.sample(context, si, lobe, u)
+            single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            total += dr.select((sample.wo.z * self._side > 0) & ~single, mi.Color3f(weight), 0)
             dr.eval(total)
         return dr.clip(total / (n * n), 0, 1)
 
@@ -185,6 +206,23 @@ def _radiance(emitter: mi.Emitter) -> mi.Texture | None:
     if emitter.class_name() != "AreaLight":
         return None
     return next(node for node, (_, depth) in mi.traverse(emitter).hierarchy.items() if depth == 1)
+
+
+class _Nested(mi.TraversalCallback):
+    """Collects the objects that a plugin is made of, by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.objects: dict[str, Any] = {}
+
+    def put(self, name: str, value: Any, *_: Any) -> None:
+        self.objects[name] = value
+
+
+def _reflects_behind(flags: int) -> bool:
+    """Whether a component of a BSDF, by its flags, reflects on its back, by more than a mirror's single direction."""
+    wide = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection
+    return bool(flags & int(wide)) and bool(flags & int(mi.BSDFFlags.BackSide))
 
 
 def _lookup(texture: mi.Texture, data: mi.TensorXf, to_uv: mi.ScalarTransform3f) -> tuple[str, str]:

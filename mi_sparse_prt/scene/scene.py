@@ -22,6 +22,7 @@ from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene
+from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, triangle_keys
 
@@ -30,21 +31,24 @@ FEW_MESHES = 12  # more are sampled together: what each took would grow with sha
 
 @dataclass(frozen=True)
 class Mesh:
-    """One mesh of a `Scene`.
+    """One mesh of a `Scene`: the front of a shape, or its back where it reflects on both sides.
 
     Attributes
     ----------
     name : str
-        The shape's id, unique in the scene.
+        The shape's id, unique in the scene; with ``_back`` for its back.
     vertices : slice
         Its vertices among the scene's.
     triangles : (n_t, 3) int32
         Indices local to the slice: the scene's vertex is ``vertices.start + index``.
+    shape : int
+        Its number among the scene's Mitsuba shapes.
     """
 
     name: str
     vertices: slice
     triangles: NDArray[np.int32]
+    shape: int = 0
 
 
 class Scene:
@@ -60,8 +64,17 @@ class Scene:
         Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal
         incidence.
     meshes : tuple of Mesh
+        The fronts of all shapes, then the backs of two-sided ones, as far as light can reach them.
+    fronts : tuple of Mesh
+        The first of these, one for each shape.
+    front_of : (n_v,) int64
+        The vertex at the same place on the front: of a front itself, of a back the one that it lies behind.
+    backs : (vertices of fronts,) int64
+        The other way round: the vertex behind each; -1 where it is dark there, or the back reflects no light.
+    dark_backs : list of str
+        Two-sided shapes with backs that no light reaches, such as the inside of a closed solid. These have no vertices.
     mitsuba : mi.Scene
-        World space: the meshes of `meshes`, in that order and with these vertices, plus the sensors, emitters
+        World space: the meshes of `fronts`, in that order and with these vertices, plus the sensors, emitters
         and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
     normalised : mi.Scene
         The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
@@ -84,34 +97,46 @@ class Scene:
         """Use `Scene.from_mitsuba`; `meshes` are clean and in world space, `materials` one for each."""
         self.path: str | None = None
         self.warnings: list[str] = []
-        self.meshes = tuple(
-            Mesh(mesh.name, slice(end - len(mesh.positions), end), mesh.triangles)
-            for mesh, end in zip(meshes, np.cumsum([len(m.positions) for m in meshes]).tolist(), strict=True)
-        )
-        self.positions = np.concatenate([m.positions for m in meshes])
-        self.normals = np.concatenate([m.normals for m in meshes])
-
-        low, high = (f(self.positions, axis=0).astype(np.float64) for f in (np.min, np.max))
+        fronts = np.concatenate([m.positions for m in meshes])
+        low, high = (f(fronts, axis=0).astype(np.float64) for f in (np.min, np.max))
         self.centre: NDArray[np.float64] = (low + high) / 2
         self.scale = float(1 / np.max(high - low))
-        self.normalised_positions = ((self.positions.astype(np.float64) - self.centre) * self.scale).astype(
-            np.float32
-        )
         world = [build_mitsuba_mesh(m, k.bsdf, k.emission()) for m, k in zip(meshes, materials, strict=True)]
         unit = [
-            build_mitsuba_mesh(m, k.bsdf, positions=self.normalised_positions[view.vertices])
-            for m, k, view in zip(meshes, materials, self.meshes, strict=True)
+            build_mitsuba_mesh(m, k.bsdf, positions=self._normalise(m.positions))
+            for m, k in zip(meshes, materials, strict=True)
         ]
         # An area emitter may outlive its shape, and Mitsuba then reads freed memory: the original is kept
         self._original = mitsuba
         names = [mesh.name for mesh in meshes]
         self.mitsuba: mi.Scene = build_mitsuba_scene(world, names, mitsuba)
         self.normalised: mi.Scene = build_mitsuba_scene(unit, names)
-        self.albedo = np.concatenate(
-            [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
-        )
         self._surfaces = meshes
-        self.materials = materials
+
+        albedo = [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
+        backs, self.dark_backs = find_backs(self.normalised, meshes, materials)
+        behind = {back.shape: materials[back.shape].back() for back in backs}
+        reflected = {k: own.albedo(world[k], meshes[k]) for k, own in behind.items()}
+        backs = [back for back in backs if reflected[back.shape].any()]
+        self.albedo = np.concatenate([*albedo, *(reflected[back.shape][back.vertices] for back in backs)])
+        self.materials = [*materials, *(behind[back.shape] for back in backs)]
+        self.meshes = _listed(meshes, backs)
+        self.fronts = self.meshes[: len(meshes)]
+        starts = [self.fronts[back.shape].vertices.start for back in backs]
+        self.front_of = np.concatenate(
+            [
+                np.arange(len(fronts)),
+                *(start + back.vertices for start, back in zip(starts, backs, strict=True)),
+            ]
+        )
+        self.backs = np.full(len(fronts), -1, np.int64)
+        self.backs[self.front_of[len(fronts) :]] = np.arange(len(fronts), len(self.front_of))
+        self.positions = fronts[self.front_of]
+        self.normals = np.concatenate([m.normals for m in (*meshes, *(back.mesh for back in backs))])
+        self.normalised_positions = self._normalise(self.positions)
+
+    def _normalise(self, positions: NDArray[np.float32]) -> NDArray[np.float32]:
+        return ((positions.astype(np.float64) - self.centre) * self.scale).astype(np.float32)
 
     @classmethod
     def from_mitsuba(cls, scene: mi.Scene, edge_length: float | None = None) -> Scene:
@@ -154,7 +179,7 @@ class Scene:
         return [
             build_mitsuba_mesh(mesh, material.bsdf) if shape.is_emitter() else shape
             for shape, mesh, material in zip(
-                self.mitsuba.shapes(), self._surfaces, self.materials, strict=True
+                self.mitsuba.shapes(), self._surfaces, self.materials[: len(self.fronts)], strict=True
             )
         ]
 
@@ -208,7 +233,8 @@ class Scene:
         """Whether all surfaces provably reflect the three channels alike (within 1e-6)."""
         even = np.max(np.ptp(self.albedo, axis=1)) <= 1e-6
         return bool(even) and all(
-            k.grey(mesh) for k, mesh in zip(self.materials, self._surfaces, strict=True)
+            k.grey(mesh)
+            for k, mesh in zip(self.materials, self._surfaces, strict=False)  # fronts
         )
 
     @cached_property
@@ -225,7 +251,7 @@ class Scene:
         """
         total = np.zeros(2, np.uint64)
         digests = set()
-        for view, mesh, material in zip(self.meshes, self._surfaces, self.materials, strict=True):
+        for view, mesh, material in zip(self.fronts, self._surfaces, self.materials, strict=False):
             digest = material.digest()
             digests.add(digest)
             seed = np.frombuffer(digest[:8], np.uint64)[0]
@@ -233,7 +259,7 @@ class Scene:
             with np.errstate(over="ignore"):
                 total[0] += np.sum(mix(keys), dtype=np.uint64)
                 total[1] += np.sum(mix(keys ^ np.uint64(0x5851F42D4C957F2D)), dtype=np.uint64)
-        count = sum(len(mesh.triangles) for mesh in self.meshes)
+        count = sum(len(mesh.triangles) for mesh in self.fronts)
         parts = [total.tobytes(), str(count).encode(), *sorted(digests)]
         return hashlib.sha256(b"|".join(parts)).hexdigest()
 
@@ -250,3 +276,20 @@ class Scene:
     def __repr__(self) -> str:
         names = ", ".join(f"{m.name} {m.vertices.stop - m.vertices.start}" for m in self.meshes)
         return f"Scene({self.n_vertices} vertices: {names})"
+
+
+def _listed(fronts: list[TriangleMesh], backs: list[Back]) -> tuple[Mesh, ...]:
+    """Their vertices follow each other; backs get names of their own."""
+    found: list[Mesh] = []
+    names = {mesh.name for mesh in fronts}
+    named = [(mesh, number, mesh.name) for number, mesh in enumerate(fronts)]
+    for back in backs:
+        name = f"{back.mesh.name}_back"
+        while name in names:
+            name += "_"
+        names.add(name)
+        named.append((back.mesh, back.shape, name))
+    for mesh, shape, name in named:
+        start = found[-1].vertices.stop if found else 0
+        found.append(Mesh(name, slice(start, start + len(mesh.positions)), mesh.triangles, shape))
+    return tuple(found)

@@ -75,7 +75,12 @@ def read_surfaces(
     for shape, mesh, material in zip(shapes, clean, materials, strict=True):
         limit = most_vertices - sum(len(m.positions) for m in meshes)
         mesh = _tessellate(shape, material, edge_length, limit) if mesh is None else mesh
-        if material.one_sided and len(mesh.triangles) and faces_inwards(mesh):
+        if (
+            not material.two_sided
+            and not material.passes_light
+            and len(mesh.triangles)
+            and faces_inwards(mesh)
+        ):
             notes.append(
                 f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
                 "(set flip_normals, or use a twosided BSDF, if that is not meant)"

@@ -15,13 +15,12 @@ from mi_sparse_prt.core.sobol import sobol_points
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.scene.shape_table import ShapeTable, first_triangles
+from mi_sparse_prt.scene.shape_table import first_triangles
 
 LANES = 1 << 23  # rays per wavefront
-# In place of a vertex: what a ray meets if it is not the front of a surface
-NOTHING = int(np.iinfo(np.int32).max)
-BEHIND = NOTHING - 1  # a surface that would reflect on its back as well
-FEW = 0.01  # such hits among all: inside of closed surfaces, where it is dark
+NOTHING = int(
+    np.iinfo(np.int32).max
+)  # in place of a vertex: what a ray meets if it meets no sheet with vertices
 
 
 def gather_matrix(
@@ -34,8 +33,8 @@ def gather_matrix(
     """G (n, n_v): what cosine-distributed rays from some vertices find, by the vertices of the triangles they hit.
 
     Each ray names one corner of its triangle, by chance and with the barycentric weight as its probability. That is
-    linear interpolation on average, for a third of the entries. A ray that meets nothing, or a surface from behind,
-    finds no light.
+    linear interpolation on average, for a third of the entries. A ray that meets nothing, or the back of a surface
+    that has no vertices there, finds no light.
 
     Parameters
     ----------
@@ -58,14 +57,11 @@ def gather_matrix(
     surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
     starting = np.arange(len(points)) if nodes is None else nodes
     size = max(1, LANES // rays_per_vertex)
-    blocks, met, behind = [], 0, 0
+    blocks = []
     for a in range(0, len(starting), size):
         ids = mi.UInt32(starting[a : a + size].astype(np.uint32))
         hits = surfaces.seen_from(arrays, ids, samples, seed)
-        met += int(np.count_nonzero(hits != NOTHING))
-        behind += int(np.count_nonzero(hits == BEHIND))
         blocks.append(_merged(hits.reshape(-1, rays_per_vertex)))
-    surfaces.check_backs(behind, met)
     counts, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32 if counts.sum() < NOTHING else np.int64)
     entries = values / np.float32(rays_per_vertex), columns, starts
@@ -77,27 +73,22 @@ class Surfaces:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene.normalised
-        shapes = scene.normalised.shapes()
-        two_sided = np.array([mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide) for shape in shapes])
-        self._two_sided = [mesh.name for mesh, both in zip(scene.meshes, two_sided, strict=True) if both]
-        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self._first_triangle = first_triangles(self._scene)
-        self._back = ShapeTable(
-            self._scene, np.where(two_sided, BEHIND, NOTHING)
-        )  # what rays from behind find
         self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
         self._normals = mi.Vector3f(scene.normals.T)
-        dr.eval(self._triangles, self._normals)
+        self._backs = mi.UInt32(np.where(scene.backs < 0, NOTHING, scene.backs).astype(np.uint32))
+        dr.eval(self._triangles, self._normals, self._backs)
 
     def seen_from(
         self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
     ) -> NDArray[np.int32]:
-        """A vertex, NOTHING or BEHIND for every sample of each point; samples side by side."""
+        """A vertex or NOTHING for every sample of each point; samples side by side."""
         ray, _, u = cosine_rays(points, ids, samples, seed)
         return mi.Int32(self.traced(ray, u)).numpy()
 
     def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
-        """A vertex, NOTHING or BEHIND for every ray; u in [0, 1) chooses among the corners of a triangle."""
+        """A vertex or NOTHING for every ray; u in [0, 1) chooses among the corners of a triangle."""
         return self._vertex(self._scene.ray_intersect_preliminary(ray), ray.d, u)
 
     def _vertex(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
@@ -114,17 +105,8 @@ class Surfaces:
             normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
         chosen = dr.select(u < b[0], corners[1], dr.select(u < b[0] + b[1], corners[2], corners[0]))
         front = dr.dot(normal, direction) < 0  # of the shading normal, as for Mitsuba's BSDFs
-        chosen = dr.select(front, chosen, self._back.gather(hit.shape, valid))
+        chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._backs, chosen, valid & ~front))
         return dr.select(valid, chosen, NOTHING)
-
-    def check_backs(self, behind: int, met: int) -> None:
-        """Refuse a scene in which many rays meet surfaces of two sides from behind."""
-        if behind > FEW * met:
-            names = "', '".join(self._two_sided[:3])
-            raise PrtError(
-                f"{behind / met:.0%} of the hits that vertices see are backs of two-sided surfaces ('{names}'): "
-                "light is gathered from fronts only; use path tracing instead"
-            )
 
 
 def cosine_rays(
@@ -172,7 +154,7 @@ def _sorted(hits: NDArray[np.int32]) -> NDArray[np.int64]:
         row.sort()
         count = 0
         for k in range(len(row)):
-            count += row[k] < BEHIND and (k == 0 or row[k] != row[k - 1])
+            count += row[k] < NOTHING and (k == 0 or row[k] != row[k - 1])
         counts[i] = count
     return counts
 
@@ -197,7 +179,7 @@ def _fill(
         at = starts[i] - 1
         for k in range(hits.shape[1]):
             vertex = hits[i, k]
-            if vertex >= BEHIND:
+            if vertex >= NOTHING:
                 break
             if k == 0 or vertex != hits[i, k - 1]:
                 at += 1

@@ -28,7 +28,7 @@ from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.solvers.first_bounce import USUAL
-from mi_sparse_prt.solvers.form_factors import BEHIND, LANES, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements, Gathered
@@ -169,7 +169,7 @@ def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: 
         vertex = surfaces.traced(ray, u)
         weights, values = lobes.incident(point, ray.d), lobes.outgoing(vertex, -ray.d)
         dr.eval(vertex, weights, values)
-        met = np.flatnonzero(vertex.numpy() < BEHIND)
+        met = np.flatnonzero(vertex.numpy() < NOTHING)
         hits.append(
             np.stack([point.numpy()[met], vertex.numpy()[met], met % rays_per_vertex]).astype(np.int64)
         )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.reflection.factor_tables import incident_tables, look_up
 from mi_sparse_prt.reflection.frames import frames
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.solvers.form_factors import BEHIND
+from mi_sparse_prt.solvers.form_factors import NOTHING
 
 Floats = NDArray[np.float32]
 
@@ -45,7 +45,7 @@ class Lobes:
 
     def outgoing(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
         """Terms g_k(w_o) of each channel in turn; ``vertex`` may be none."""
-        valid = vertex < BEHIND
+        valid = vertex < NOTHING
         local = self._local(vertex, direction, valid)
         valid &= local.z > 0
         return [v for table in self._outgoing for v in self._looked_up(table, vertex, local, valid)]

@@ -314,7 +314,7 @@ class RadiositySolver(FiniteElements):
     contacts : Contacts
         Vertices whose light is in part none for the triangles around them.
     matrix : (n_nodes, n_v) sparse float32
-        G. Rows sum to the share of the hemisphere, by cosine, in which fronts of surfaces are seen.
+        G. Rows sum to the share of the hemisphere, by cosine, in which sheets of surfaces are seen that have vertices.
     channels : {1, 3}
         1 in a grey scene.
     rays : int
@@ -323,8 +323,7 @@ class RadiositySolver(FiniteElements):
     Raises
     ------
     PrtError
-        If a surface is not diffuse, or if vertices often see the backs of surfaces that reflect on both sides: light
-        is known at their fronts only.
+        If a surface is not diffuse.
     """
 
     def __init__(

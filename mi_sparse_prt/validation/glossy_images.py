@@ -248,7 +248,7 @@ class _References:
         """Pixels (height, width) of the whole image, on glossy surfaces, and in thin shadows."""
         shape, normal = self._seen(sensor)
         image = np.ones(shape.shape, bool)
-        found = _surfaces(self._transport).material[[mesh.vertices.start for mesh in self._scene.meshes]] >= 0
+        found = _surfaces(self._transport).material[[mesh.vertices.start for mesh in self._scene.fronts]] >= 0
         glossy = np.append(found, False)[shape]  # -1: none
         light = self._path("diffuse", sensor, 2, 4 * spp, seed).mean(axis=2)
         unshadowed = self._unshadowed(normal.reshape(-1, 3)).reshape(shape.shape)
@@ -278,7 +278,7 @@ class _References:
         place = mi.Point2f(np.stack([x.ravel(), y.ravel()]).astype(np.float32))
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), place, mi.Point2f(0.5))
         si = self._scene.mitsuba.ray_intersect(ray)
-        table = ShapeTable(self._scene.mitsuba, np.arange(len(self._scene.meshes)))
+        table = ShapeTable(self._scene.mitsuba, np.arange(len(self._scene.fronts)))
         number = table.gather(si.shape, si.is_valid()).numpy()
         shape = np.where(si.is_valid().numpy(), number.astype(np.int64), -1)
         return shape.reshape(height, width), np.array(si.sh_frame.n).T.reshape(height, width, 3)
@@ -315,18 +315,18 @@ def _surfaces(transport: LightTransport) -> InOutFactors:
 def _factored_shapes(scene: Scene, transport: LightTransport, shapes: list[mi.Mesh]) -> list[mi.Mesh]:
     """The meshes with the glossy BSDFs replaced by the transport's factors of them."""
     found, surfaces = [], _surfaces(transport)
-    for shape, mesh, own in zip(shapes, scene.meshes, scene.materials, strict=True):
+    for shape, mesh, own in zip(shapes, scene.fronts, scene.materials, strict=False):
         number = int(surfaces.material[mesh.vertices.start])
         if number >= 0:
-            shape = with_bsdf(shape, factored_bsdf(surfaces.factors[number], own.bsdf))
+            shape = with_bsdf(shape, factored_bsdf(surfaces.factors[number], own.bsdf), own.two_sided)
         found.append(shape)
     return found
 
 
-def with_bsdf(mesh: mi.Mesh, bsdf: mi.BSDF) -> mi.Mesh:
+def with_bsdf(mesh: mi.Mesh, bsdf: mi.BSDF, two_sided: bool = False) -> mi.Mesh:
     """A copy with another BSDF and the same vertices, normals and texture coordinates."""
     properties = mi.Properties()
-    properties["bsdf"] = bsdf
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf}) if two_sided else bsdf
     textured = mesh.has_vertex_texcoords()
     copy = mi.Mesh(
         mesh.id(),

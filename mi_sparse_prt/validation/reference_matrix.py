@@ -60,7 +60,7 @@ class ReferenceMatrix:
             self._parameters = mi.traverse(self._sky)
         if camera is None:
             lit = self._sky if distant else scene.mitsuba
-            rays = rays or vertex_rays(scene.normalised if distant else lit)
+            rays = rays or vertex_rays(scene.normalised if distant else lit, scene)
             self._vertices = mi.load_dict({"type": "mesh_vertices", "vertices": len(rows)})
             self._vertices.bind(lit, rays.take(rows))
 

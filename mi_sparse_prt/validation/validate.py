@@ -187,7 +187,7 @@ def _chosen_rows(
 ) -> _Rows:
     if transport.measurement.kind == "vertices":
         ids = _stratified_vertices(transport.meshes, n_rows, rng)
-        return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised))
+        return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised, scene))
     if transport.measurement.image is None:
         raise PrtError(f"validate renders vertices and pixels, not {transport.measurement.kind!r}")
     camera, pixels = scene.sensor(sensor), transport.shape[0]

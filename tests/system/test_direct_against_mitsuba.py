@@ -131,7 +131,7 @@ def test_no_vertex_is_missed(kind, artefact):
     }[kind]
     floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": grey}
     scene = build(float("inf") if kind == "slivers" else 0.7, floor=floor, **shapes)
-    rays = vertex_rays(scene.normalised)
+    rays = vertex_rays(scene.normalised, scene)
     assert rays.missed.sum() == 0
 
     lighting = prt.CubemapLighting(2)

@@ -78,7 +78,7 @@ def compare(
 
     ``reference``: number of independent renders, and samples of each.
     """
-    lighting, rays = prt.CubemapLighting(n), vertex_rays(scene.normalised)
+    lighting, rays = prt.CubemapLighting(n), vertex_rays(scene.normalised, scene)
     shape = (len(rows), lighting.n_directions)
     vertex, texel = np.repeat(rows, shape[1]), np.tile(np.arange(shape[1]), shape[0])
     points, channels = sensor_points(scene, rays), 1 if scene.grey else 3

@@ -194,7 +194,7 @@ def test_bad_measurements_are_one_line(scene, pixels, lighting, transport):
             "film": {"type": "hdrfilm"},
         }
     )
-    with pytest.raises(prt.PrtError, match="sees no front"):
+    with pytest.raises(prt.PrtError, match="sees no surface that reflects"):
         prt.camera_pixels(scene, away, spp=1)
     with pytest.raises(prt.PrtError, match="pixels of another camera"):
         prt.render(scene, transport, 1.0, away)

@@ -129,7 +129,7 @@ class Mitsuba:
     """Indirect light that leaves the vertices under an environment: `path` at two depths."""
 
     def __init__(self, scene: prt.Scene, light: dict, max_depth: int) -> None:
-        rays = vertex_rays(scene.normalised)
+        rays = vertex_rays(scene.normalised, scene)
         shapes = {f"shape_{k}": shape for k, shape in enumerate(scene.normalised.shapes())}
         sensor = {"type": "mesh_vertices", "vertices": len(rays.origins)}
         self.lit = mi.load_dict({"type": "scene", "light": light, "sensor": sensor, **shapes})

@@ -34,7 +34,7 @@ SCENE = """<scene version="3.0.0">
     </shape>
 </scene>
 """
-VERTICES = 4 + 24
+VERTICES = 4 + 24 + 4  # the floor has two sides
 PRECOMPUTE = ["--method", "brute_force", "--resolution", "4", "--spp", "2", "--edge-length", "inf"]
 
 
@@ -108,7 +108,7 @@ def test_precompute_writes_matrix_and_report(folder, matrix):
     )
     assert np.array_equal(transport.rows(range(VERTICES)), expected.rows(range(VERTICES)))
     assert report["elements_total"] == VERTICES * 96
-    assert report["estimated_error"]["meshes"].keys() == {"floor[1]", "box"}
+    assert report["estimated_error"]["meshes"].keys() == {"floor[1]", "box", "floor[1]_back"}
     assert report["file"] == {"path": str(matrix), "bytes": matrix.stat().st_size}
     assert report["scene"]["path"] == str(folder / "scene.xml")
     assert report == transport.report | {"file": report["file"]}
@@ -122,7 +122,7 @@ def test_precompute_prints_what_was_done_and_skipped(folder, matrix):
         "total",
         "forecast",
         "peak memory",
-        "2,688",
+        "3,072",
         "floor[1]",
         "Skipped",
         "below the horizon",
@@ -303,7 +303,7 @@ def test_relight_rotates_and_writes_vertices(folder, scene, matrix, environment)
     loaded = prt.load_scene(scene, float("inf"))
     assert np.allclose(np.array(mesh["vertex_color"]).reshape(-1, 3), transport.relight(light))
     assert np.array_equal(np.array(mesh["vertex_positions"]).reshape(-1, 3), loaded.positions)
-    assert len(mesh["faces"]) == 3 * (2 + 12)
+    assert len(mesh["faces"]) == 3 * (2 + 12 + 2)
 
 
 def test_relight_loads_the_scene_as_precompute_did(folder, environment):

@@ -165,12 +165,6 @@ def test_what_cannot_be_gathered_is_refused():
         solver(scene)
     with pytest.raises(PrtError, match="100 is not a power of two"):
         solver(build(shape={"type": "cube"}), rays=100)
-    leaf = {"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": WHITE}}
-    behind = {**leaf, "to_world": T().translate([0, 0, 0.5])}
-    with pytest.raises(PrtError, match="100% .* backs of two-sided surfaces .'behind'"):
-        solver(build(front={"type": "rectangle", "bsdf": WHITE}, behind=behind))
-    facing = {**leaf, "to_world": T().translate([0, 0, 0.5]).rotate([0, 1, 0], 180)}
-    assert solver(build(front={"type": "rectangle", "bsdf": WHITE}, behind=facing)).matrix.nnz
 
 
 # ------------------------------------------------------------------------------------------ products
