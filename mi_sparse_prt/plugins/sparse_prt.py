@@ -18,6 +18,7 @@ from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, Re
 from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.scene.scene import Scene
 
+LAMP_SPP = 128  # paths per vertex and lamp, where paths are traced: a grain of 1.5% on walls
 _UNSEEN = "DirectionalArea"  # no path from a camera finds its light, those of ``path`` neither
 
 
@@ -36,7 +37,8 @@ class SparsePRT(mi.SamplingIntegrator):
     their own, a column each, for light that is reflected more than once. What they send to the camera themselves, or
     after one reflection, is found at the pixel as ``path`` finds it, by shadow rays: shadows of small lamps are
     sharp, and any BSDF is exact there. That light has noise, which more samples per pixel reduce. Light that lamps send
-    on more than once leaves surfaces as if these were diffuse, also with ``terms``.
+    on more than once leaves surfaces as if these were diffuse, also with ``terms``; what of it reaches surfaces by way
+    of mirrors and glass is left out.
 
     ``mi.traverse`` and ``update`` on the environment, or on how bright a lamp is (``radiance.value``,
     ``intensity.value``, ``irradiance.value``, ``scale``), relight; no matrix is computed again. A lamp that moved,
@@ -67,7 +69,8 @@ class SparsePRT(mi.SamplingIntegrator):
     method              string     As for ``prt.precompute``; for lamps all but ``brute_force`` mean ``auto``. (auto)
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
-    precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16)
+    precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16; of lamps
+                                   128)
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the environment's matrix to aim at. (0: that of
@@ -162,6 +165,7 @@ class SparsePRT(mi.SamplingIntegrator):
         lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
         settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed")}
         settings["method"] = "brute_force" if by_paths else "auto"
+        settings["spp"] = settings["spp"] or LAMP_SPP
         transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)
         return transport.operators["indirect"].relight(lamps.brightness)
 

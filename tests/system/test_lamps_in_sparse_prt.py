@@ -59,6 +59,12 @@ SHINY = """
     <shape type="sphere" id="shiny"><bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>
         <point name="center" x="-0.4" y="-0.7" z="0.3"/><float name="radius" value="0.3"/></shape>"""
 
+MIRROR_AND_GLASS = """
+    <shape type="sphere" id="mirror"><bsdf type="conductor"/>
+        <point name="center" x="-0.4" y="-0.6" z="0.3"/><float name="radius" value="0.35"/></shape>
+    <shape type="sphere" id="glass"><bsdf type="dielectric"/>
+        <point name="center" x="0.6" y="-0.7" z="0.6"/><float name="radius" value="0.25"/></shape>"""
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -162,7 +168,7 @@ def test_direct_light_is_that_of_path(folder, artefact):
 
     Expected: nothing but noise between `path` and ours.
     """
-    scene = load(folder, PLAIN + BULB + BEAM + FAR + SLIDE + SHINY, 2)
+    scene = load(folder, PLAIN + BULB + BEAM + FAR + SLIDE + SHINY + MIRROR_AND_GLASS, 2)
     bias, error, distance = beside_path(scene, 2, artefact)
     assert error < 0.003
     assert abs(bias) < 4 * error
@@ -176,6 +182,18 @@ def test_lamps_alone(folder, artefact):
     assert error < 0.003
     assert abs(bias) < 0.01
     assert distance < 0.02
+
+
+def test_lamps_and_what_they_light_in_mirrors_and_glass(folder, artefact):
+    """Rationale: direct light at what a camera sees by way of mirrors and glass is found there, not at these.
+
+    Lamps without a surface: `path` finds no light of theirs by way of mirrors either.
+    """
+    scene = load(folder, BULB + BEAM + MIRROR_AND_GLASS, -1)
+    bias, error, distance = beside_path(scene, -1, artefact)
+    assert error < 0.003
+    assert abs(bias) < 0.01
+    assert distance < 0.03
 
 
 def test_a_screen_that_is_seen(folder, artefact):
