@@ -257,7 +257,8 @@ def test_the_command_line_tells_what_a_file_of_lamps_holds(transport, tmp_path):
 def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
     transport.save(tmp_path / "a.prt")
     loaded = prt.load_transport(tmp_path / "a.prt")
-    assert loaded.emission.names == transport.emission.names
+    assert loaded.lights == transport.lights
+    assert sorted(loaded.lights) == ["beam", "bulb", "panel", "sky"]
     assert np.array_equal(loaded.relight({"beam": 2.0}), transport.relight({"beam": 2.0}))
     with_scene = prt.load_transport(tmp_path / "a.prt", scene)
     images = [prt.render(scene, t, 1.0, spp=4) for t in (with_scene, transport)]
