@@ -1,4 +1,4 @@
-"""Makes docs/images/lamps.jpg and pixels.jpg: other columns and other rows of T, beside Mitsuba's ``path``.
+"""Makes docs/images/lamps.jpg, room.jpg and pixels.jpg: other columns and other rows of T, beside Mitsuba's ``path``.
 
 ``python docs/lamps_and_pixels.py`` from the root of the repository. It takes some minutes.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import matplotlib
@@ -28,8 +29,9 @@ Image = NDArray[np.float32]
 
 
 def main() -> None:
-    """Both pictures."""
+    """All pictures."""
     draw_lamps()
+    draw_room()
     draw_pixels()
 
 
@@ -46,6 +48,25 @@ def draw_lamps() -> None:
     images["Mitsuba path"], noise = reference(lit, lit.sensors()[0])
     compare("lamps", images["all"], images["Mitsuba path"], noise)
     draw(images, np.percentile(images["all"], 98), IMAGES / "lamps.jpg")
+
+
+def draw_room() -> None:
+    """The room by ``sparse_prt``, and again with its panel at a tenth, beside Mitsuba."""
+    lit = mi.load_dict(room(), optimize=False)
+    integrator = mi.load_dict({"type": "sparse_prt", "max_depth": DEPTH, "progress": False})
+    parameters, images = mi.traverse(lit), {}
+    for light in ("as authored", "dimmed"):
+        start = perf_counter()
+        mi.render(lit, integrator=integrator, spp=4)
+        print(f"{light}: {perf_counter() - start:.1f} s with 4 samples per pixel")
+        image = np.array(mi.render(lit, integrator=integrator, spp=1024, seed=5))[..., :3]
+        truth, noise = reference(lit, lit.sensors()[0])
+        compare(light, image, truth, noise)
+        images |= {f"sparse_prt, {light}": image, f"path, {light}": truth}
+        images[f"10 x error, {light}"] = 10 * np.abs(image - truth)
+        parameters["panel.emitter.radiance.value"] *= 0.1
+        parameters.update()
+    draw(images, np.percentile(images["path, as authored"], 98), IMAGES / "room.jpg")
 
 
 def draw_pixels() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.io.cache_folder import cache_folder
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.precompute import precompute
@@ -40,7 +42,7 @@ _ROOMS = (
 
 def cached_precompute(
     scene: Scene,
-    lighting: CubemapLighting,
+    lighting: CubemapLighting | UnitLamps,
     folder: Path | None = None,
     progress: bool = True,
     **settings: Any,
@@ -50,16 +52,19 @@ def cached_precompute(
     Parameters
     ----------
     scene : Scene
-    lighting : CubemapLighting
+    lighting : CubemapLighting or UnitLamps
+        Of lamps, columns are those of brightness 1.
     folder : Path, optional
         Made if it does not exist; the default is ``cache_folder()``. Files in it may be deleted at any time.
     progress : bool
     **settings
-        As for ``precompute``. Together with the scene's hash and the algorithms they are the key of the file; the order
-        of the scene's shapes is not part of it.
+        As for ``precompute``. Together with the hashes of the scene and of its lamps and the algorithms they are the
+        key of the file; the order of the scene's shapes is not part of it.
     """
     folder = folder or cache_folder()
-    key = [_algorithms(), scene.hash, asdict(Settings(lighting.resolution, **settings))]
+    lamps = lighting if isinstance(lighting, UnitLamps) else None
+    known = Settings(1 if isinstance(lighting, UnitLamps) else lighting.resolution, **settings)
+    key = [_algorithms(), scene.hash, lamps and lamps.hash, asdict(known)]
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()
     path = folder / f"{digest[:32]}.prt"
     if path.exists():
@@ -67,7 +72,8 @@ def cached_precompute(
             return load_transport(path, scene)
         except PrtError as error:
             warnings.warn(f"cache: {error}", PrtWarning, stacklevel=2)
-    transport = precompute(scene, lighting, progress=progress, checkpoint_folder=folder, **settings)
+    with lamps.at_unit_brightness() if lamps else nullcontext():
+        transport = precompute(scene, lighting, progress=progress, checkpoint_folder=folder, **settings)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         transport.save(path)

@@ -126,6 +126,11 @@ class LightTransport:
         return self.measurement.groups
 
     @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of lamps in the order of columns: an area light's mesh, another's id or kind; none of a cubemap."""
+        return tuple(map(str, self.emission.coordinates.get("lamp", ())))
+
+    @property
     def terms(self) -> int:
         """K of its glossy points, 0 where all are diffuse."""
         return self.reflection.terms

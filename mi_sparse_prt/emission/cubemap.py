@@ -212,23 +212,37 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
         raise PrtError(
             f"emitter {emitter.class_name()} is not an environment: it does not shine from infinity"
         )
-    n = lighting.resolution
-    s = _samples_per_edge(emitter, n)
+    n, texels = lighting.resolution, np.arange(lighting.n_directions)
+    if (s := _samples_per_edge(emitter, n)) is not None:
+        return _sampled(emitter, texels, n, s)[0].astype(np.float32)
+    # a formula may have a sun of half a degree in it: two samples meet it, and its texels get more of them
+    coarse = max(16, -(-384 // n))
+    radiance, peaks = _sampled(emitter, texels, n, coarse)
+    sharp = np.flatnonzero(peaks > 2 * radiance.max(axis=1))
+    radiance[sharp] = _sampled(emitter, sharp, n, 16 * coarse)[0]
+    return radiance.astype(np.float32)
+
+
+def _sampled(
+    emitter: mi.Emitter, texels: NDArray[np.intp], n: int, s: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means (k, 3) and largest values (k,) of texels from s x s samples each."""
     block = max(1, (1 << 20) // s**2)  # a million directions at once: about 100 MB
-    radiance = np.empty((lighting.n_directions, 3))  # [texel, rgb]
-    for start in range(0, lighting.n_directions, block):
-        texels = np.arange(start, min(start + block, lighting.n_directions))
-        directions, weights = subtexels(texels, n, s)
+    radiance, peaks = np.empty((len(texels), 3)), np.empty(len(texels))
+    for start in range(0, len(texels), block):
+        own = slice(start, start + block)
+        directions, weights = subtexels(texels[own], n, s)
         si = dr.zeros(mi.SurfaceInteraction3f, weights.size)
         si.wi = mi.Vector3f(np.ascontiguousarray(-directions.reshape(-1, 3).T, dtype=np.float32))
         values = np.array(emitter.eval(si), dtype=np.float64)  # [rgb, texel * sub], one column if constant
         values = np.broadcast_to(values, (3, weights.size)).reshape(3, *weights.shape)
-        radiance[texels] = ((values * weights).sum(axis=2) / weights.sum(axis=1)).T
-    return radiance.astype(np.float32)
+        radiance[own] = ((values * weights).sum(axis=2) / weights.sum(axis=1)).T
+        peaks[own] = values.max(axis=(0, 2))
+    return radiance, peaks
 
 
-def _samples_per_edge(emitter: mi.Emitter, n: int) -> int:
-    """Samples along a texel's edge that resolve the emitter: its own texels, or a quarter of its pixels."""
+def _samples_per_edge(emitter: mi.Emitter, n: int) -> int | None:
+    """Samples along a texel's edge that resolve an image: its own texels, or a quarter of its pixels; else None."""
     own_resolution = getattr(emitter, "resolution", None)
     if own_resolution is not None:  # our `cubemap`: one sample in each of its texels is exact
         return max(1, own_resolution // n)
@@ -236,7 +250,7 @@ def _samples_per_edge(emitter: mi.Emitter, n: int) -> int:
     shape: tuple[int, ...] = parameters["data"].shape if "data" in parameters else ()
     if len(shape) == 3:  # an image [row, col, rgb] with rows of pi / h radians; a texel is at most 2 / n wide
         return max(4, int(np.ceil(4 * (2 / n) / (np.pi / shape[0]))))
-    return 16
+    return None
 
 
 def _project_image(environment: Environment, lighting: CubemapLighting) -> NDArray[np.float32]:

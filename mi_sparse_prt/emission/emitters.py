@@ -16,7 +16,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.scene import Scene
 
 # parameters of Mitsuba's emitters that their light is proportional to, and of the textures these may be
-_RADIATED = ("radiance", "intensity", "irradiance", "data")
+RADIATED = ("radiance", "intensity", "irradiance", "data")
 _LEAVES = ("value", "data")
 
 
@@ -48,7 +48,7 @@ class SceneEmitters:
 
     def __init__(self, scene: Scene, groups: Mapping[str, Sequence[str]] | None = None) -> None:
         self._scene = scene.mitsuba
-        known = _emitter_names(scene)
+        known = emitter_names(scene)
         if not known:
             raise PrtError(
                 f"the scene {scene.path or ''} has no emitters: add an area light, a point, a spot ..."
@@ -239,39 +239,53 @@ def _dimmed(
     """Multiply what an emitter sends out by an RGB triple; its parameters, and what they were."""
     parameters = mi.traverse(emitter)
     light = [
-        key for key in parameters.keys() if key.split(".")[0] in _RADIATED and key.split(".")[-1] in _LEAVES
+        key for key in parameters.keys() if key.split(".")[0] in RADIATED and key.split(".")[-1] in _LEAVES
     ]
     if not light:
         light = [key for key in parameters.keys() if key.endswith("_scale")]
-        if not light or np.ptp(brightness):
-            raise PrtError(
-                f"the emitter {emitter.id()!r} ({emitter.class_name()}) takes no colour; dim it evenly"
-            )
+    even = not np.ptp(brightness)
+    if not light or not (even or all(_coloured(parameters[key]) for key in light)):
+        raise PrtError(
+            f"the emitter {emitter.id()!r} ({emitter.class_name()}) takes no colour; dim it evenly"
+        )
     before = {key: type(parameters[key])(parameters[key]) for key in [*light, "sampling_weight"]}
     for key in light:
         value = before[key]
-        if isinstance(value, mi.Color3f):
+        if isinstance(value, mi.TensorXf):  # an image, (height, width, channels)
+            parameters[key] = mi.TensorXf(np.array(value) * (brightness[0] if even else brightness))
+        elif isinstance(value, mi.Color3f):
             parameters[key] = value * mi.Color3f(*map(float, brightness))
-        elif isinstance(value, float):
+        else:
             parameters[key] = value * float(brightness[0])
-        else:  # an image, (height, width, 3)
-            parameters[key] = type(value)(np.array(value) * brightness)
     if not brightness.any():
         parameters["sampling_weight"] = 0.0
     parameters.update()
     return parameters, before
 
 
-def _emitter_names(scene: Scene) -> dict[str, int]:
-    """Numbers of all emitters by name: the mesh's, or the emitter's own id."""
-    numbers = dr.reinterpret_array(mi.UInt32, scene.mitsuba.emitters_dr()).numpy().tolist()
-    on_shapes = {
-        int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter())).numpy()[0]): mesh.name
-        for shape, mesh in zip(scene.mitsuba.shapes(), scene.fronts, strict=True)
+def _coloured(value: Any) -> bool:
+    """Whether a parameter has a number for each channel."""
+    return isinstance(value, mi.Color3f) or (isinstance(value, mi.TensorXf) and value.shape[-1] == 3)
+
+
+def meshes_of_emitters(scene: Scene) -> dict[int, int]:
+    """Numbers of the meshes that shine, by the numbers of their emitters."""
+    pointers = dr.reinterpret_array(mi.UInt32, scene.mitsuba.emitters_dr()).numpy().tolist()
+    numbers = {pointer: k for k, pointer in enumerate(pointers)}
+    return {
+        numbers[int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter())).numpy()[0])]: k
+        for k, shape in enumerate(scene.mitsuba.shapes())
         if shape.is_emitter()
     }
+
+
+def emitter_names(scene: Scene) -> dict[str, int]:
+    """Numbers of all emitters by name: the mesh's, or the emitter's own id, or its kind."""
+    on_shapes = meshes_of_emitters(scene)
     names: dict[str, int] = {}
-    for k, (number, emitter) in enumerate(zip(numbers, scene.mitsuba.emitters(), strict=True)):
-        name = on_shapes.get(number) or emitter.id() or f"emitter_{k}"
+    for k, emitter in enumerate(scene.mitsuba.emitters()):
+        name = scene.fronts[on_shapes[k]].name if k in on_shapes else emitter.id()
+        if not name or name.startswith("_"):  # Mitsuba's and ours for what has no name
+            name = f"{emitter.class_name().lower()}_{k}"
         names[name if name not in names else f"{name}_{k}"] = k
     return names

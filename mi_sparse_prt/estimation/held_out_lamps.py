@@ -13,7 +13,8 @@ from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
-POINTS = 256  # of each group
+POINTS = 256  # of each group, at most
+ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has fewer points
 SPP = 256
 
 
@@ -22,10 +23,11 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     stream = random_stream(seed, HELD_OUT)
     rng, m, seeds = np.random.default_rng(stream), problem.emission.size, element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
-    samples = {}
-    for group in transport.measurement.groups:
+    samples, groups = {}, transport.measurement.groups
+    most = int(np.clip(ELEMENTS // (m * len(groups)), 2, POINTS))
+    for group in groups:
         size = group.vertices.stop - group.vertices.start
-        ids = group.vertices.start + np.sort(rng.choice(size, min(size, POINTS), replace=False))
+        ids = group.vertices.start + np.sort(rng.choice(size, min(size, most), replace=False))
         asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
         ours = transport.incident.elements(*asked).astype(np.float64)
         x, y = (_true(problem, asked, *pair) for pair in (seeds[:2], seeds[2:]))

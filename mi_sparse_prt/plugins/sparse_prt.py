@@ -6,25 +6,43 @@ import warnings
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.cache import cached_precompute
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
+from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.scene.scene import Scene
+
+LAMP_SPP = 128  # paths per vertex and lamp, where paths are traced: a grain of 1.5% on walls
+_UNSEEN = "DirectionalArea"  # no path from a camera finds its light, those of ``path`` neither
 
 
 class SparsePRT(mi.SamplingIntegrator):
     r"""Precomputed light transport integrator (:monosp:`sparse_prt`)
     --------------------------------------------------------------
 
-    A scene lit by its environment through a precomputed light transport matrix.
+    A scene lit by its environment and its lamps through precomputed light transport matrices.
 
-    On the first render of a scene its matrix is computed and kept in a cache; later renders, under whatever
-    environment (``envmap``, ``constant``, ``cubemap``) and from whatever camera, only apply it. The camera sees the
-    irradiance of the vertices, interpolated over triangles, times the albedo texture at the pixel. Emitters other than
-    the environment do not take part.
+    On the first render of a scene its matrices are computed and kept in a cache; later renders, under whatever
+    environment (``envmap``, ``constant``, ``sunsky``, ``cubemap``), with lamps however bright and from whatever camera,
+    only apply them. The camera sees the irradiance of the vertices, interpolated over triangles, times the albedo
+    texture at the pixel.
+
+    Lamps are all other emitters (``area``, ``point``, ``spot``, ``directional``, ``projector``). They have a matrix of
+    their own, a column each, for light that is reflected more than once. What they send to the camera themselves, or
+    after one reflection, is found at the pixel as ``path`` finds it, by shadow rays: shadows of small lamps are
+    sharp, and any BSDF is exact there. That light has noise, which more samples per pixel reduce. Light that lamps send
+    on more than once leaves surfaces as if these were diffuse, also with ``terms``; what of it reaches surfaces by way
+    of mirrors and glass is left out.
+
+    ``mi.traverse`` and ``update`` on the environment, or on how bright a lamp is (``radiance.value``,
+    ``intensity.value``, ``irradiance.value``, ``scale``), relight; no matrix is computed again. A lamp that moved,
+    turned or has another texture needs the matrix of lamps again; other geometry or materials need both.
 
     .. tabs::
         .. code-tab:: xml
@@ -48,13 +66,15 @@ class SparsePRT(mi.SamplingIntegrator):
     Parameter           Type       Meaning
     =================== ========== =============================================================================
     resolution          integer    Texels along an edge of the lighting's cubemap, a power of two. (32)
-    method              string     As for ``prt.precompute``. (auto)
+    method              string     As for ``prt.precompute``; for lamps all but ``brute_force`` mean ``auto``. (auto)
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
-    precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16)
+    precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16; of lamps
+                                   128)
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
-    target_error        float      Relative L2 error of the matrix to aim at. (0: that of ``prt.precompute``)
+    target_error        float      Relative L2 error of the environment's matrix to aim at. (0: that of
+                                   ``prt.precompute``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               integer    Of in-out factors: BSDFs that are not diffuse are then shaded for the view, per
@@ -110,32 +130,61 @@ class SparsePRT(mi.SamplingIntegrator):
         Raises
         ------
         PrtError
-            If the scene has no environment, or cannot be used (see ``prt.load_scene``, ``prt.precompute``).
+            If the scene has no light, or cannot be used (see ``prt.load_scene``, ``prt.precompute``).
         """
         if self._use_reference:
             return self._reference.render(scene, sensor, seed, spp, develop, evaluate)
-        environment = scene.environment()
-        if environment is None:
+        lamps = _has_lamps(scene)
+        if scene.environment() is None and not lamps:
             raise PrtError(
-                "sparse_prt: the scene has no environment; add an emitter envmap, constant or cubemap"
+                "sparse_prt: the scene has no light; add an emitter: envmap, constant, area, point ..."
             )
-        if len(scene.emitters()) > 1:
-            warnings.warn(
-                "sparse_prt: only the environment lights the scene, its other emitters are left out",
-                PrtWarning,
-                stacklevel=2,
-            )
-        surfaces = Scene.from_mitsuba(scene, self._edge_length)
-        relit = self._relit(surfaces, environment)
-        return RelitIntegrator(relit).render(scene, sensor, seed, spp, develop, evaluate)
+        surfaces = _read(scene, self._edge_length)
+        relit = self._relit(surfaces, scene.environment(), lamps)
+        depth = self._settings["max_depth"]
+        integrator = LampLitIntegrator(relit, scene, depth) if lamps else RelitIntegrator(relit[0])
+        return integrator.render(scene, sensor, seed, spp, develop, evaluate)
 
-    def _relit(self, surfaces: Scene, environment: mi.Emitter) -> RelitScene:
+    def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:
+        """All light but that which lamps send to the camera directly or after one reflection."""
+        irradiance = np.zeros((surfaces.n_vertices, 3), np.float32)
+        depth = self._settings["max_depth"]
+        if lamps and depth != 2:
+            irradiance += self._light_of_lamps(surfaces)
+        if environment is None:
+            return [RelitScene(surfaces, irradiance, None, max_depth=depth)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
-        if transport.terms:
-            return GlossyRelitScene(surfaces, transport, environment, environment)
-        return RelitScene(
-            surfaces, transport.irradiance(environment), environment, max_depth=transport.max_depth
-        )
+        if not transport.terms:
+            irradiance += transport.irradiance(environment)
+            return [RelitScene(surfaces, irradiance, environment, max_depth=depth)]
+        relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment)]
+        return [*relit, RelitScene(surfaces, irradiance, None, max_depth=depth)] if lamps else relit
+
+    def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
+        """Irradiance / pi (n_v, 3) of light of lamps that was reflected at least once before."""
+        lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
+        settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed")}
+        settings["method"] = "brute_force" if by_paths else "auto"
+        settings["spp"] = settings["spp"] or LAMP_SPP
+        transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)
+        return transport.operators["indirect"].relight(lamps.brightness)
 
     def to_string(self) -> str:
         return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"
+
+
+def _read(scene: mi.Scene, edge_length: float | None) -> Scene:
+    """The surfaces of a scene; that matrices of a cubemap have no light of lamps is not for users of this plugin."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "shape '.*' is an area emitter", PrtWarning)
+        return Scene.from_mitsuba(scene, edge_length)
+
+
+def _has_lamps(scene: mi.Scene) -> bool:
+    """Whether emitters other than the environment shine; those of unknown kinds on shapes are refused (PrtError)."""
+    for shape in scene.shapes():
+        if shape.is_emitter() and (kind := shape.emitter().class_name()) not in ("AreaLight", _UNSEEN):
+            raise PrtError(
+                f"sparse_prt: shape '{shape.id()}' has an emitter of type {kind}; give it one of type area"
+            )
+    return any(not e.is_environment() and e.class_name() != _UNSEEN for e in scene.emitters())

@@ -6,6 +6,7 @@ until they meet no more of it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -72,36 +73,16 @@ class RelitScene:
     def radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
         if self._goes_on:
-            return self._followed(ray, sampler, active)
+            return follow_single_directions(self._seen, ray, sampler, active, self._most)
         value, si = self._met(ray, mi.Point2f(0.5), active, active)
         return value, active & si.is_valid()
 
-    @dr.syntax
-    def _followed(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
-        """As ``radiance``, where rays go on."""
-        context = mi.BSDFContext()
-        context.type_mask = int(mi.BSDFFlags.Delta)
-        ray, active = mi.Ray3f(ray), mi.Mask(active)
-        total, throughput = mi.Color3f(0), mi.Color3f(1)
-        depth, valid = mi.UInt32(0), mi.Mask(False)
-        most = dr.opaque(mi.UInt32, self._most)
-        active &= depth < most
-        while active:
-            u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
-            value, si = self._met(ray, u, active, active & (depth + 1 < most))
-            total += dr.select(active, throughput * value, 0)
-            active &= si.is_valid()
-            valid |= active
-            bsdf = si.bsdf()
-            active &= _scatters_into_single_directions(bsdf)
-            sample, weight = bsdf.sample(
-                context, si, sampler.next_1d(active), mi.Point2f(sampler.next_2d(active)), active
-            )
-            throughput *= weight
-            ray = si.spawn_ray(si.to_world(sample.wo))
-            depth += 1
-            active &= (depth < most) & (dr.max(throughput) > 0)
-        return total, valid
+    def _seen(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, depth: mi.UInt32, last: mi.Mask, active: mi.Mask
+    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
+        """See ``follow_single_directions``."""
+        u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
+        return self._met(ray, u, active, active & ~last)
 
     def _met(
         self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask
@@ -154,6 +135,51 @@ class RelitScene:
             value = bsdf.eval(mi.BSDFContext(), si, out, valid & shared)
             reflected = dr.select(shared, value * dr.pi / dr.maximum(dr.abs(out.z), 1e-6), reflected)
         return irradiance * reflected
+
+
+@dr.syntax
+def follow_single_directions(
+    seen: Callable[..., tuple[mi.Color3f, mi.SurfaceInteraction3f]],
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
+    most: int,
+) -> tuple[mi.Color3f, mi.Mask]:
+    """What rays see that go on through mirrors, glass and masks, and whether they meet any surface.
+
+    Parameters
+    ----------
+    seen : callable
+        Of a ray, the sampler, how many surfaces it met before, whether none may reflect after these, and whether it is
+        active: the radiance of what it meets, but for what that scatters into single directions, and what it meets.
+    ray : Ray3f, world
+    sampler : Sampler
+    active : Mask
+    most : int
+        Surfaces and the light after them, as ``max_depth``.
+    """
+    context = mi.BSDFContext()
+    context.type_mask = int(mi.BSDFFlags.Delta)
+    ray, active = mi.Ray3f(ray), mi.Mask(active)
+    total, throughput = mi.Color3f(0), mi.Color3f(1)
+    depth, valid = mi.UInt32(0), mi.Mask(False)
+    limit = dr.opaque(mi.UInt32, most)
+    active &= depth < limit
+    while active:
+        value, si = seen(ray, sampler, depth, depth + 1 >= limit, active)
+        total += dr.select(active, throughput * value, 0)
+        active &= si.is_valid()
+        valid |= active
+        bsdf = si.bsdf()
+        active &= _scatters_into_single_directions(bsdf)
+        sample, weight = bsdf.sample(
+            context, si, sampler.next_1d(active), mi.Point2f(sampler.next_2d(active)), active
+        )
+        throughput *= weight
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        depth += 1
+        active &= (depth < limit) & (dr.max(throughput) > 0)
+    return total, valid
 
 
 def _scatters_into_single_directions(bsdf: mi.BSDFPtr) -> mi.Mask:

@@ -36,6 +36,11 @@ def bsdf_class(bsdf: mi.BSDF) -> str:
     return own if own != "BSDF" else str(bsdf.class_name())
 
 
+def printed(thing: mi.Object) -> str:
+    """An object as Mitsuba prints it, without addresses of Python plugins."""
+    return re.sub(r" at 0x[0-9a-f]+", "", str(thing))
+
+
 class Material:
     """A shape's BSDF, and what can be said about it.
 
@@ -55,12 +60,13 @@ class Material:
     passes_straight : bool
         Some of it goes straight on, as if nothing were there.
     constant : bool
-        It certainly does not vary over the surface nor with its rotation.
+        It certainly does not vary over the surface nor with its rotation, and neither does the shape's own light.
     """
 
     def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
         self.name = name
         self._emitter = shape.emitter() if shape.is_emitter() else None
+        self._radiance = None if self._emitter is None else _radiance(self._emitter)
         self._set_bsdf(shape.bsdf(), 1)
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
@@ -81,7 +87,7 @@ class Material:
     def _set_bsdf(self, bsdf: mi.BSDF, side: int) -> None:
         """Look at a BSDF from its front (1) or its back (-1)."""
         self.bsdf, self._side = bsdf, side
-        self._text = re.sub(r" at 0x[0-9a-f]+", "", str(bsdf))  # no addresses of Python plugins
+        self._text = printed(bsdf)
         # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
         self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
         flags = int(bsdf.flags())
@@ -91,7 +97,8 @@ class Material:
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
-        self.constant = self._classes <= PLAIN
+        textured = self._radiance is not None and self._radiance.is_spatially_varying()
+        self.constant = self._classes <= PLAIN and not textured
 
     def back(self) -> Material:
         """What the back of the shape is made of."""
@@ -105,12 +112,15 @@ class Material:
         return behind
 
     def emission(self) -> mi.Emitter | None:
-        """A copy of the shape's area emitter for another shape; None if it has none or a textured one."""
-        if self._emitter is None:
+        """A copy of the shape's area emitter for another shape, with the same texture if it has one; None without.
+
+        Other emitters of shapes (``directionalarea``) are found by no path from a camera, and are left out.
+        """
+        if self._radiance is None:
             return None
         values = mi.traverse(self._emitter)
         if "radiance.value" not in values:
-            return None
+            return mi.load_dict({"type": "area", "radiance": self._radiance})
         radiance = np.ravel(values["radiance.value"]).astype(float)
         spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
         return mi.load_dict({"type": "area", "radiance": spectrum})
@@ -176,18 +186,29 @@ class Material:
         return all(_has_equal_channels(parameters[k]) for k in parameters.keys() if not k.endswith("to_uv"))
 
     def digest(self) -> bytes:
-        """SHA-256 of the BSDF's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
-        state = hashlib.sha256(self._text.encode())
-        parameters = mi.traverse(self.bsdf)
-        for name in sorted(parameters.keys()):
-            value = parameters[name]
-            state.update(name.encode())
-            state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
-            texture = next((of for of in parameters.properties[name] if isinstance(of, mi.Texture)), None)
-            if name.endswith("data") and texture is not None and value.ndim == 3:
-                found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
-                state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
-        return state.digest()
+        """SHA-256 of the BSDF, see ``digest``."""
+        return digest(self._text, mi.traverse(self.bsdf))
+
+
+def digest(text: str, parameters: mi.SceneParameters, left_out: tuple[str, ...] = ()) -> bytes:
+    """SHA-256 of an object's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
+    state = hashlib.sha256(text.encode())
+    for name in sorted(set(parameters.keys()) - set(left_out)):
+        value = parameters[name]
+        state.update(name.encode())
+        state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())
+        texture = next((of for of in parameters.properties[name] if isinstance(of, mi.Texture)), None)
+        if name.endswith("data") and texture is not None and value.ndim == 3:
+            found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
+            state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
+    return state.digest()
+
+
+def _radiance(emitter: mi.Emitter) -> mi.Texture | None:
+    """The texture, of one colour or more, that an area light shines with; None of emitters of other kinds."""
+    if emitter.class_name() != "AreaLight":
+        return None
+    return next(node for node, (_, depth) in mi.traverse(emitter).hierarchy.items() if depth == 1)
 
 
 class _Nested(mi.TraversalCallback):

@@ -95,13 +95,26 @@ def build_mitsuba_scene(
     shapes: list[mi.Mesh], names: list[str], original: mi.Scene | None = None
 ) -> mi.Scene:
     """A Mitsuba scene of these meshes, in order, with the original's sensors, emitters and integrator."""
-    content = watertight_scene()
-    content.update(dict(zip(names, shapes, strict=True)))
+    content = dict(zip(names, shapes, strict=True))
+    others: dict[str, mi.Object] = {}
     if original is not None:
         on_shapes = [s.emitter() for s in original.shapes() if s.is_emitter()]
         on_shapes += [s.sensor() for s in original.shapes() if s.is_sensor()]
-        others = [*original.sensors(), *original.emitters(), original.integrator()]
-        for k, thing in enumerate(t for t in others if t is not None and not any(t is s for s in on_shapes)):
+        things = [*original.sensors(), *original.emitters(), original.integrator()]
+        for k, thing in enumerate(t for t in things if t is not None and not any(t is s for s in on_shapes)):
             key = thing.id()
-            content[key if key and "." not in key and key not in content else f"_other_{k}"] = thing
-    return mi.load_dict(content, optimize=False)
+            free = key and "." not in key and key not in ("type", *content, *others)
+            others[key if free else f"_other_{k}"] = thing
+    return scene_of(others, content)
+
+
+def scene_of(kept: dict[str, mi.Object], others: dict[str, Any] | None = None) -> mi.Scene:
+    """A scene of objects by name, which rays do not slip between.
+
+    Mitsuba gives them these names as ids; those that are ``kept`` belong to a user's scene, and get theirs back.
+    """
+    ids = [thing.id() for thing in kept.values()]
+    scene = mi.load_dict({**watertight_scene(), **(others or {}), **kept}, optimize=False)
+    for thing, name in zip(kept.values(), ids, strict=True):
+        thing.set_id(name)
+    return scene

@@ -75,8 +75,7 @@ class Scene:
         Two-sided shapes with backs that no light reaches, such as the inside of a closed solid. These have no vertices.
     mitsuba : mi.Scene
         World space: the meshes of `fronts`, in that order and with these vertices, plus the sensors, emitters
-        and integrator of the original scene (the same objects; area emitters of one colour are copied, textured
-        ones left out).
+        and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
     normalised : mi.Scene
         The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
         no sensors.

@@ -86,8 +86,8 @@ class LampRays:
         direction, irradiance, distance = self._emission.sample(lamp, position, uv)
         cosine = dr.dot(self._points.normal(point), direction)
         lit = (cosine > 0) & (dr.max(irradiance) > 0)
-        ray = start_ray(self._points, point, direction)
-        ray.maxt = shadow_length(self._scene, distance)
+        lamp_at = self._points.position(point) + direction * (distance * self._scene.scale)
+        ray = ray_to(start_ray(self._points, point, direction), lamp_at)
         lit &= ~self._scene.normalised.ray_test(ray, lit)
         value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0)
         return [value.x, value.y, value.z]
@@ -117,7 +117,7 @@ class LampPaths(PathSolver):
         def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
             uv = mi.Point2f(rng.next_float32(), rng.next_float32())
             direction, irradiance, distance = self._emission.sample(texel, to_world(self._world, si.p), uv)
-            return direction, irradiance, shadow_length(self._world, distance)
+            return direction, irradiance, distance * self._world.scale
 
         return trace_reflected(self.scene, ray, Light(sample), rng, bounces)
 
@@ -127,6 +127,14 @@ def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:
     return p / scene.scale + mi.Point3f(*map(float, scene.centre))
 
 
-def shadow_length(scene: Scene, distance: mi.Float) -> mi.Float:
-    """How far shadow rays go in the normalised frame: nearly to the light, as Mitsuba's do."""
-    return distance * (scene.scale * (1 - mi.math.ShadowEpsilon))
+def ray_to(ray: mi.Ray3f, place: mi.Point3f) -> mi.Ray3f:
+    """A shadow ray from the origin of another nearly to a place, as Mitsuba's ``Interaction.spawn_ray_to``.
+
+    The origin is off its surface. A ray of the length that was measured from the surface would end inside of a lamp
+    that is near.
+    """
+    towards = place - ray.o
+    distance = dr.norm(towards)
+    return mi.Ray3f(
+        ray.o, towards / distance, distance * (1 - mi.math.ShadowEpsilon), ray.time, ray.wavelengths
+    )

@@ -189,7 +189,7 @@ class Light:
     ----------
     sample : callable
         Of an interaction (its ``p`` in the frame of the scene) and the random numbers of a path: a direction, the
-        irradiance at right angles to it, and how far a shadow ray goes, None for ever.
+        irradiance at right angles to it, and how far the light is, None if it is not near.
     contains : callable, optional
         A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths
         that leave the scene right after one collect ``radiance`` if they leave towards the light.
@@ -248,9 +248,7 @@ def trace_reflected(
         )
         # NaN is lit, so that it is noticed, and what factored BSDFs make negative
         lit = active & ~dr.all(value == 0)
-        shadow = si.spawn_ray(towards)
-        if reach is not None:
-            shadow.maxt = reach
+        shadow = si.spawn_ray(towards) if reach is None else si.spawn_ray_to(si.p + towards * reach)
         lit &= ~scene.ray_test(shadow, lit)
         result += dr.select(lit, throughput * value * irradiance, 0)
 

@@ -128,10 +128,30 @@ def test_a_column_is_the_scene_with_one_lamp(scene, transport, name):
     lit = "lamp" if name == "panel" else name
     alone = prt.Scene.from_mitsuba(room((lit,)), 0.12)
     x, y = rendered_at_vertices(alone)
-    column = transport.columns([transport.emission.names.index(name)])[:, 0]
+    column = transport.columns([transport.lights.index(name)])[:, 0]
     assert np.allclose(column, transport.relight({name: 1.0}), atol=1e-6 * column.max())
     assert column.mean() == pytest.approx((x.mean() + y.mean()) / 2, rel=0.01)
     assert relative_l2_without_noise(column, x, y)[0] < 0.05
+
+
+def test_a_lamp_close_to_a_surface_lights_it():
+    """Rationale: shadow rays end before the lamp, however near it is. Truth: the form factor of a square above a point.
+
+    A square of 0.2 x 0.2, 0.1 above a floor of 2 x 2.
+    """
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+    lamp = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0, 0.1]).rotate([1, 0, 0], 180).scale(0.1),
+        "emitter": {"type": "area", "radiance": 1.0},
+    }
+    lit = mi.load_dict({"type": "scene", "floor": floor, "lamp": lamp}, optimize=False)
+    scene = prt.Scene.from_mitsuba(lit, 0.5)
+    light = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=2, progress=False).relight(1.0)
+    below = np.flatnonzero((np.abs(scene.positions) < 1e-5).all(axis=1))
+    assert len(below) == 1
+    truth = 4 / np.pi * np.arctan(np.sqrt(0.5)) * np.sqrt(0.5)
+    np.testing.assert_allclose(light[below[0]], truth, rtol=0.01)
 
 
 def test_validation_sees_what_is_wrong_with_lamps(scene, transport):
@@ -237,7 +257,8 @@ def test_the_command_line_tells_what_a_file_of_lamps_holds(transport, tmp_path):
 def test_a_file_keeps_lamps_by_name(scene, transport, tmp_path):
     transport.save(tmp_path / "a.prt")
     loaded = prt.load_transport(tmp_path / "a.prt")
-    assert loaded.emission.names == transport.emission.names
+    assert loaded.lights == transport.lights
+    assert sorted(loaded.lights) == ["beam", "bulb", "panel", "sky"]
     assert np.array_equal(loaded.relight({"beam": 2.0}), transport.relight({"beam": 2.0}))
     with_scene = prt.load_transport(tmp_path / "a.prt", scene)
     images = [prt.render(scene, t, 1.0, spp=4) for t in (with_scene, transport)]

@@ -275,21 +275,11 @@ def test_bad_values_are_refused_when_loading(parameters, message):
         mi.load_dict({"type": "sparse_prt", **parameters})
 
 
-def test_no_environment(folder):
-    for emitter in ("", '<emitter type="directional"/>'):
-        with pytest.raises(Exception) as error:
-            picture(load(folder, emitter))
-        assert "sparse_prt: the scene has no environment; add an emitter" in reasons(error.value)
+def test_no_light(folder):
+    with pytest.raises(Exception) as error:
+        picture(load(folder, ""))
+    assert "sparse_prt: the scene has no light; add an emitter" in reasons(error.value)
     assert not (folder / "cache").exists()
-
-
-def test_other_emitters_are_named_and_left_out(folder):
-    """A lamp beside the environment: a warning, and the picture without it."""
-    alone = picture(load(folder), seed=1)
-    lamp = '<emitter type="point"><point name="position" x="0" y="3" z="0"/></emitter>'
-    with pytest.warns(prt.PrtWarning, match="only the environment"):
-        image = picture(load(folder, EMITTERS["envmap"] + lamp), seed=1)
-    assert np.array_equal(image, alone)
 
 
 def test_no_mesh(folder):

@@ -1,5 +1,6 @@
 """The cubemap's geometry against independent formulas, and the exactness of projections onto it."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -228,6 +229,20 @@ def test_constant_emitter_and_plain_values():
     for same in (emitter, (1, 2, 3), np.array([1, 2, 3]), mi.ScalarColor3f(1, 2, 3)):
         np.testing.assert_allclose(lighting.project(same), np.broadcast_to([1, 2, 3], (96, 3)), rtol=1e-6)
     np.testing.assert_array_equal(lighting.project(2), np.full((96, 3), 2, np.float32))
+
+
+@pytest.mark.parametrize("n", [8, 32])
+def test_a_sun_smaller_than_samples_keeps_its_energy(n):
+    """`sunsky`: its sun is half a degree wide and most of its light. Truth: Mitsuba's own samples of it."""
+    sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.3, 0.5, 0.8]})
+    uv = np.random.default_rng(0).random((2, 1 << 17)).astype(np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, uv.shape[1])
+    samples = sky.sample_direction(si, mi.Point2f(uv))[1].numpy()
+    mean, error = samples.mean(axis=1), samples.std(axis=1) / np.sqrt(uv.shape[1])
+    lighting = prt.CubemapLighting(n)
+    found = (lighting.project(sky) * lighting.solid_angles[:, None]).sum(axis=0)
+    assert (error < 0.005 * mean).all()
+    assert (np.abs(found - mean) < 0.005 * mean + 3 * error).all()
 
 
 @pytest.mark.parametrize("n", [4, 8, 2, 16])

@@ -571,3 +571,7 @@ def test_to_xarray_refuses_what_does_not_fit(monkeypatch):
     monkeypatch.setattr("psutil.virtual_memory", lambda: Memory)
     with pytest.raises(prt.PrtError, match="ask for some rows"):
         made_up("bits").to_xarray()
+
+
+def test_a_cubemap_has_no_lamps():
+    assert made_up("bits").lights == ()

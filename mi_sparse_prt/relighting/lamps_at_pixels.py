@@ -1,0 +1,80 @@
+"""Light of lamps that vertices cannot show, found at the pixel: lamps that are seen, and the shadows that they cast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_sparse_prt.relighting.image import (
+    MOST_MIRRORS,
+    RelitIntegrator,
+    RelitScene,
+    follow_single_directions,
+)
+from mi_sparse_prt.scene.mitsuba_meshes import scene_of
+from mi_sparse_prt.solvers.paths import has_mirrors
+
+
+class LampLitIntegrator(RelitIntegrator):
+    """Looks at relit surfaces, and adds what lamps send to the camera themselves or after one reflection.
+
+    The latter is Mitsuba's ``path`` of ``max_depth`` 2 among the lamps alone: shadow rays and rays of the BSDF at every
+    sample of a pixel, on the shapes as the scene has them. Mirrors, glass and masks on the way to a surface are no
+    reflections in this sense.
+
+    Parameters
+    ----------
+    relit : sequence of RelitScene
+        All other light; what they show is added up.
+    scene : mi.Scene
+        The shapes and the lamps, and maybe an environment, which is left out.
+    max_depth : int
+        As for ``path``, at least 2 or -1.
+    """
+
+    def __init__(self, relit: Sequence[RelitScene], scene: mi.Scene, max_depth: int) -> None:
+        super().__init__(relit[0])
+        self._more = relit[1:]
+        self._scene = scene if scene.environment() is None else without_environment(scene)
+        self._direct = mi.load_dict({"type": "path", "max_depth": 2})
+        self._goes_on = has_mirrors(scene)
+        self._most = max_depth if 0 <= max_depth < MOST_MIRRORS else MOST_MIRRORS
+
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Mask = True,
+    ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
+        value, valid, others = super().sample(scene, sampler, ray, medium, active)
+        for relit in self._more:
+            value += relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))[0]
+        if self._goes_on:
+            direct, _ = follow_single_directions(
+                self._seen, mi.Ray3f(ray), sampler, mi.Mask(active), self._most
+            )
+        else:
+            direct, _, _ = self._direct.sample(self._scene, sampler, ray, medium, active)
+        return value + direct, valid, others
+
+    def _seen(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, depth: mi.UInt32, last: mi.Mask, active: mi.Mask
+    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
+        """See ``follow_single_directions``; a lamp seen in a mirror is among the mirror's direct light."""
+        si = self._scene.ray_intersect(ray, active)
+        direct, _, _ = self._direct.sample(
+            self._scene, sampler, mi.RayDifferential3f(ray), None, active & ~last
+        )
+        before = active & ~last & (depth > 0)
+        return direct - dr.select(before, si.emitter(self._scene, before).eval(si, before), 0), si
+
+
+def without_environment(scene: mi.Scene) -> mi.Scene:
+    """A scene of the same shapes and emitters but the environment."""
+    on_shapes = [shape.emitter() for shape in scene.shapes() if shape.is_emitter()]
+    free = [e for e in scene.emitters() if not e.is_environment() and not any(e is s for s in on_shapes)]
+    return scene_of({f"kept_{k}": thing for k, thing in enumerate([*scene.shapes(), *free])})
