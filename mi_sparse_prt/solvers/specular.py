@@ -292,10 +292,13 @@ def specular_light(
     walks, albedo = SpecularRays(problem), problem.reflection.albedo[every]
     seeds = iter(element_seeds(random_stream(seed, SPECULAR), 64))
     rows, parts = walks.parts_that_see(every, next(seeds))
+    texels = problem.emission.size
     traced, strata, free = len(every) * PARTS**2, options.first, _unblocked(problem, albedo)
+    passed = _passed_twice(problem, every, options.strata, next(seeds), next(seeds))
     while True:
         halves = [
-            _sampled(walks, every, (rows, parts), strata, next(seeds), problem.emission.size) for _ in "ab"
+            [light + straight for light in _sampled(walks, every, (rows, parts), strata, next(seeds), texels)]
+            for straight in passed
         ]
         traced += 2 * len(rows) * strata**2
         square, noise = _compared(halves, albedo)
@@ -304,12 +307,18 @@ def specular_light(
             break
         strata *= 2
     mean = [(a + b) * np.float32(0.5) for a, b in zip(*halves, strict=True)]
-    if problem.scene.passes_straight:
-        passed = passed_light(DirectSolver(problem, options.strata, next(seeds)), every)
-        mean = [one + passed for one in mean]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
     operator = SparseRows(tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean)))
     return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), traced)
+
+
+def _passed_twice(problem: Problem, ids: Ids, strata: int, *seeds: int) -> list[Sparse]:
+    """``passed_light``, independently where it is random; nothing where nothing lets light pass."""
+    if not problem.scene.passes_straight:
+        return [scipy.sparse.csr_array((len(ids), problem.emission.size), dtype=np.float32)] * 2
+    if problem.basis == "direction":
+        return [passed_light(DirectSolver(problem), ids)] * 2
+    return [passed_light(DirectSolver(problem, strata, seed), ids) for seed in seeds]
 
 
 def _sampled(

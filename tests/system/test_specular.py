@@ -45,15 +45,14 @@ def objects(albedo: float) -> dict:
     }
 
 
-@pytest.mark.parametrize("basis", ["texel", "direction"])
-def test_furnace(basis):
+def test_furnace():
     """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
 
     Expected: every diffuse mesh has a mean irradiance of 1 within 1%, of which the parts that are new are 2% and more:
     without what arrives by mirrors and glass, or without what they send from surface to surface, it is less.
     """
-    scene, lighting = build(0.25, **objects(1.0)), prt.CubemapLighting(8)
-    transport = prt.precompute(scene, lighting, "gather", basis=basis, max_depth=-1, progress=False)
+    scene, lighting = build(0.12, **objects(1.0)), prt.CubemapLighting(4)
+    transport = prt.precompute(scene, lighting, "gather", basis="texel", max_depth=-1, progress=False)
     light = np.ones((lighting.n_directions, 3), np.float32)
     irradiance = transport.irradiance(light).mean(axis=1)
     specular = transport.operators["specular"].relight(light).mean(axis=1)
@@ -91,7 +90,7 @@ def test_noise_is_told():
     scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
     problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
     ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
-    exact = specular_light(problem, 9, SpecularOptions(8, 8)).operator.rows(ids) * power
+    exact = specular_light(problem, 9, SpecularOptions(8, 8, strata=8)).operator.rows(ids) * power
     noises = []
     for strata in (1, 2):
         found = specular_light(problem, 4, SpecularOptions(strata, strata))
