@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.converged_reference import MAX_DEPTH
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
@@ -27,6 +29,7 @@ from mi_sparse_prt.storage import load_transport
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
 DONE, REFUSED, ERROR, TOO_LONG = "done", "refused", "error", "too long"
+GRACE = 5.0  # seconds in which an idle process may end by itself
 SEEDS = 7919  # passes of one half stay apart from those of the other
 
 Image = NDArray[np.float32]  # (height, width, 3), linear RGB
@@ -139,6 +142,9 @@ class RenderingProcess:
         return self
 
     def __exit__(self, *reasons: object) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._process.join(GRACE)
         self._end()
 
     def call(self, work: Callable[..., Any], *arguments: Any, seconds: float) -> tuple[str, Any]:
@@ -170,7 +176,7 @@ class RenderingProcess:
 
     def _end(self) -> None:
         if self._connection is not None:
-            self._process.kill()  # a kernel that runs listens to nothing else
+            self._process.kill()  # gently would not do: a kernel that runs listens to nothing else
             self._process.join()
             self._connection.close()
             self._connection = None
@@ -179,6 +185,9 @@ class RenderingProcess:
 def _serve(connection: Connection) -> None:
     """Do what is asked for until nobody asks any more."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once and without a word
+    tqdm.set_lock(
+        threading.RLock()
+    )  # its own is shared among processes, and would be left behind by one that is ended
     while True:
         try:
             work, arguments = connection.recv()

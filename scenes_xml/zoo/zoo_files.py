@@ -56,11 +56,12 @@ def ball(rings: int = 14, segments: int = 28, radius: float = 0.5) -> Grid:
     a, b, c, d = (index[i : i + rings, j : j + segments].ravel() for i in (0, 1) for j in (0, 1))
     lower = np.stack([a, c, d], axis=-1)[:-segments]  # without those that shrink to a pole
     upper = np.stack([a, d, b], axis=-1)[segments:]
+    used, triangles = np.unique(np.concatenate([upper, lower]), return_inverse=True)
     return Grid(
-        (normals * radius + [0, radius + 0.02, 0]).astype(np.float32),
-        normals.astype(np.float32),
-        np.stack([u, 1 - v], axis=-1).astype(np.float32),
-        np.concatenate([upper, lower]).astype(np.uint32),
+        (normals * radius + [0, radius + 0.02, 0])[used].astype(np.float32),
+        normals[used].astype(np.float32),
+        np.stack([u, 1 - v], axis=-1)[used].astype(np.float32),
+        triangles.reshape(-1, 3).astype(np.uint32),
     )
 
 
