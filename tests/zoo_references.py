@@ -12,7 +12,7 @@ from mi_sparse_prt.benchmark.zoo_rendering import Pair, ZooEffort, render_refere
 
 STORED = Path(__file__).parent / "data" / "zoo.npz"
 SIZE = {"width": "48", "height": "36"}
-EFFORT = ZooEffort(passes=32, noise=0.003)
+EFFORT = ZooEffort(spp=128, passes=32, noise=0.003)
 SCENES = (
     "bsdf_diffuse",
     "bsdf_onesided",

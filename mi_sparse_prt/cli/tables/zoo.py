@@ -17,7 +17,11 @@ def zoo_tables(report: dict[str, Any]) -> list[Table]:
     kinds = groupby(report["scenes"], key=lambda found: found["name"].partition("_")[0])
     sections = [[_row(found) for found in scenes] for _, scenes in kinds]
     counts = ", ".join(f"{count} {verdict}" for verdict, count in report["counts"].items())
-    title = f"{len(report['scenes'])} scenes: {counts} (relative L2 of the image, beyond noise)"
+    machine = report["machine"]
+    title = (
+        f"{len(report['scenes'])} scenes: {counts}\nErrors are relative L2 of images beyond noise; "
+        f"load average {machine['load_average']:.1f} (over {machine['cores']}: disturbed, times are too long)"
+    )
     said = [(sentence, ", ".join(names)) for sentence, names in scenes_by_sentence(report).items()]
     tables = [new_table(title, COLUMNS, *sections)]
     return tables + ([new_table("What was said of the others", ("", "scenes"), said)] if said else [])

@@ -31,7 +31,7 @@ def test_scenes_agree(name, artefact):
 
     Expected: within 2% beyond the noise of both, with noise that could hide no more than 1%; the same image 5% brighter
         does not agree, and would be told to be off by nobody.
-    Result: 0.3% to 1.7%.
+    Result: 0.1% to 1.2%; noise could hide 0.4% to 0.6%.
     """
     truth = stored(name)
     ours = render_matrix(ZOO / f"{name}.xml", EFFORT, **SIZE)
