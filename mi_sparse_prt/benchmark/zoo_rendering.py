@@ -6,6 +6,7 @@ What takes too long is ended with its process, and a scene that takes its proces
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import tempfile
 import threading
@@ -185,6 +186,7 @@ class RenderingProcess:
 def _serve(connection: Connection) -> None:
     """Do what is asked for until nobody asks any more."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once and without a word
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     tqdm.set_lock(
         threading.RLock()
     )  # its own is shared among processes, and would be left behind by one that is ended
@@ -198,6 +200,14 @@ def _serve(connection: Connection) -> None:
         except Exception as error:  # whatever it is belongs into the table
             answer = _explained(error)
         connection.send(answer)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it is gone: nobody waits for the picture any more."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _explained(error: BaseException) -> tuple[str, str]:
