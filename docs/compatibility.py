@@ -31,6 +31,8 @@ sys.path.insert(0, str(ROOT / "scenes_xml" / "zoo"))
 
 from make_zoo import LEFT_OUT  # noqa: E402
 
+from mi_sparse_prt.cli.tables.zoo import verdict_words  # noqa: E402
+
 
 def main() -> None:
     """Write the page's own part anew, and the pictures."""
@@ -51,9 +53,11 @@ def page(report: dict[str, Any]) -> list[str]:
     counts = ", ".join(f"{count} {verdict}" for verdict, count in report["counts"].items())
     numbers: dict[str, int] = {}  # of sentences
     rows = [table_row(scene, numbers) for scene in report["scenes"]]
+    machine = report["machine"]
+    times = f"Times are from {machine['cores']} cores under a load of {machine['load_average']:.1f}"
     return [
         "",
-        f"{len(report['scenes'])} scenes: {counts}.",
+        f"{len(report['scenes'])} scenes: {counts}. {times}; above {machine['cores']}, others were working, too.",
         "",
         f"| {' | '.join(COLUMNS)} | |",
         "|" + "---|" * (len(COLUMNS) + 1),
@@ -71,7 +75,7 @@ def page(report: dict[str, Any]) -> list[str]:
 def table_row(scene: dict[str, Any], numbers: dict[str, int]) -> str:
     """A scene's line; sentences are numbered as they come, and said below the table."""
     shares = (scene[name] for name in ("error", "uncertainty", "estimated_error"))
-    cells = [f"`{scene['name']}`", scene["verdict"], *("" if s is None else f"{s:.1%}" for s in shares)]
+    cells = [f"`{scene['name']}`", verdict_words(scene), *("" if s is None else f"{s:.1%}" for s in shares)]
     cells.append("" if scene["seconds"] is None else f"{scene['seconds']:.1f} s")
     said = scene["sentences"] if scene["verdict"] != "agrees" else []
     notes = [numbers.setdefault(shortened(sentence), len(numbers) + 1) for sentence in said]

@@ -61,8 +61,8 @@ def measure_zoo(
         JSON as it is. ``machine``, ``parameters``, ``counts`` of each verdict, and ``scenes``, each with ``name``,
         ``verdict`` (see ``verdict``; ``refused`` by the package, ``error``, ``too long``), ``error`` (relative L2 of
         the image, without the noise of both sides), ``uncertainty`` (an error that noise alone may show),
-        ``noise`` of the reference, ``seconds``, ``estimated_error`` of its matrix, and ``sentences``: its warnings,
-        or why there is no picture.
+        ``noise`` of the reference, ``seconds``, ``estimated_error`` of its matrix, ``told_by`` (see ``told_by``), and
+        ``sentences``: its warnings, or why there is no picture.
 
     Raises
     ------
@@ -116,21 +116,24 @@ def _measure_scene(process: RenderingProcess, path: Path, effort: ZooEffort) -> 
 
 def _without_picture(path: Path, outcome: str, sentence: str) -> Report:
     unknown = dict.fromkeys(("error", "uncertainty", "noise", "seconds", "estimated_error"))
-    return {"name": path.stem, "verdict": outcome, **unknown, "sentences": [sentence]}
+    return {"name": path.stem, "verdict": outcome, **unknown, "told_by": [], "sentences": [sentence]}
 
 
 def judge(name: str, ours: Rendering, truth: Pair) -> Report:
     """The report of a scene of which there are pictures by both."""
     error, uncertainty = image_error(ours.images, truth)
     about_picture = [w for w in ours.warnings if not any(part in w for part in NOT_ABOUT_PICTURES)]
+    told = told_by(error, ours.estimated_error, bool(about_picture))
+    found = verdict(error, uncertainty, bool(told))
     return {
         "name": name,
-        "verdict": verdict(error, uncertainty, ours.estimated_error, bool(about_picture)),
+        "verdict": found,
         "error": error,
         "uncertainty": uncertainty,
         "noise": relative_noise(*truth),
         "seconds": ours.seconds,
         "estimated_error": ours.estimated_error,
+        "told_by": told if found == TOLD else [],
         "sentences": ours.warnings,
     }
 
@@ -140,24 +143,32 @@ def image_error(ours: Pair, truth: Pair) -> tuple[float, float]:
     return relative_l2_without_noise(ours[0], truth[0], truth[1], other_estimate=ours[1])
 
 
-def verdict(error: float, uncertainty: float, estimate: float | None, warned: bool) -> str:
+def told_by(error: float, estimate: float | None, warned: bool) -> list[str]:
+    """Who said that an image has this error.
+
+    ``"estimate"``, where the matrix's own is at least half of it; ``"warning"``, where one said that the picture would
+    not be right.
+    """
+    close = estimate is not None and estimate >= HALF * error
+    return ["estimate"] * close + ["warning"] * warned
+
+
+def verdict(error: float, uncertainty: float, told: bool) -> str:
     """What an image's error means.
 
     Parameters
     ----------
     error, uncertainty : float
         As ``image_error`` finds them.
-    estimate : float or None
-        What the matrix says of itself.
-    warned : bool
-        Whether a warning said that the picture would not be right.
+    told : bool
+        Whether anybody said that there is such an error.
 
     Returns
     -------
     str
-        ``agrees``: within 2%; ``unclear``: it seems so, but noise may hide more. If it does not: ``told to be off``
-        where a warning said so, or the estimate is no less than half of the error; else ``off``.
+        ``agrees``: within 2%; ``unclear``: it seems so, but noise may hide more. If it is not: ``told to be off`` where
+        somebody said so, else ``off``.
     """
     if error <= LIMIT:
         return AGREES if uncertainty <= LIMIT else UNCLEAR
-    return TOLD if warned or (estimate is not None and estimate >= HALF * error) else OFF
+    return TOLD if told else OFF

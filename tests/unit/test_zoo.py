@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mi_sparse_prt.benchmark.zoo import LIMIT, ZOO, Rendering, image_error, judge, scene_files, verdict
+from mi_sparse_prt.benchmark.zoo import (
+    LIMIT,
+    ZOO,
+    Rendering,
+    image_error,
+    judge,
+    scene_files,
+    told_by,
+    verdict,
+)
 from mi_sparse_prt.benchmark.zoo_figures import GAP, LABEL, SceneImages, draw_contact_sheet
 from mi_sparse_prt.benchmark.zoo_rendering import RenderingProcess
 from mi_sparse_prt.cli.tables.zoo import zoo_tables
@@ -51,19 +60,20 @@ def test_the_files_are_those_of_the_script():
 
 
 @pytest.mark.parametrize(
-    "error, uncertainty, estimate, warned, expected",
+    "error, uncertainty, estimate, warned, teller, expected",
     [
-        (0.019, 0.01, 0.05, False, "agrees"),
-        (0.019, 0.01, None, True, "agrees"),
-        (0.019, 0.03, 0.05, False, "unclear"),
-        (0.021, 0.01, 0.011, False, "told to be off"),
-        (0.021, 0.01, 0.010, False, "off"),
-        (0.9, 0.01, 0.05, True, "told to be off"),
-        (0.9, 0.01, None, False, "off"),
+        (0.019, 0.01, 0.001, False, [], "agrees"),
+        (0.019, 0.03, 0.001, False, [], "unclear"),
+        (0.019, 0.01, 0.05, True, ["estimate", "warning"], "agrees"),
+        (0.021, 0.01, 0.011, False, ["estimate"], "told to be off"),
+        (0.021, 0.01, 0.010, False, [], "off"),
+        (0.9, 0.01, 0.05, True, ["warning"], "told to be off"),
+        (0.9, 0.01, None, False, [], "off"),
     ],
 )
-def test_verdicts(error, uncertainty, estimate, warned, expected):
-    assert verdict(error, uncertainty, estimate, warned) == expected
+def test_verdicts(error, uncertainty, estimate, warned, teller, expected):
+    assert told_by(error, estimate, warned) == teller
+    assert verdict(error, uncertainty, bool(teller)) == expected
 
 
 def test_errors_are_found_beneath_noise():
@@ -87,7 +97,8 @@ def test_errors_are_found_beneath_noise():
     silent = Rendering(noisy(1.04), 1.0, 0.01, said)
     assert judge("it", silent, noisy(1.0))["verdict"] == "off"
     outspoken = Rendering(noisy(1.04), 1.0, 0.01, [*said, "shape 'it': drawn as diffuse"])
-    assert judge("it", outspoken, noisy(1.0))["verdict"] == "told to be off"
+    found = judge("it", outspoken, noisy(1.0))
+    assert (found["verdict"], found["told_by"]) == ("told to be off", ["warning"])
 
 
 def test_a_process_outlives_what_fails_in_it():
@@ -130,17 +141,15 @@ def test_tables_name_who_was_told_what():
 
     def scene(name: str, verdict: str, *sentences: str) -> dict:
         numbers = dict.fromkeys(("error", "uncertainty", "estimated_error", "seconds"), 0.5)
-        return {"name": name, "verdict": verdict, **numbers, "sentences": list(sentences)}
+        by = ["warning"] if verdict == "told to be off" else []
+        return {"name": name, "verdict": verdict, **numbers, "told_by": by, "sentences": list(sentences)}
 
-    found = [
-        scene("bsdf_a", "agrees", "hush"),
-        scene("bsdf_b", "off", "loud"),
-        scene("shape_c", "off", "loud"),
-    ]
+    found = [scene("bsdf_a", "agrees", "hush"), scene("bsdf_b", "off", "loud")]
+    found.append(scene("shape_c", "told to be off", "loud"))
     console = Console(width=150, record=True)
     machine = {"load_average": 0.5, "cores": 2}
-    for table in zoo_tables({"scenes": found, "counts": {"off": 2, "agrees": 1}, "machine": machine}):
+    for table in zoo_tables({"scenes": found, "counts": {"off": 1, "agrees": 1}, "machine": machine}):
         console.print(table)
     text = console.export_text()
-    assert "3 scenes: 2 off, 1 agrees" in text
+    assert "3 scenes: 1 off, 1 agrees" in text and "told to be off (warning)" in text
     assert "hush" not in text and text.count("loud") == 1 and "bsdf_b, shape_c" in text

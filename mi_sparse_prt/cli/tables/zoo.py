@@ -37,7 +37,13 @@ def scenes_by_sentence(report: dict[str, Any]) -> dict[str, list[str]]:
     return found
 
 
+def verdict_words(found: dict[str, Any]) -> str:
+    """The verdict on a scene, and who told."""
+    by = " and ".join(found["told_by"])
+    return f"{found['verdict']} ({by})" if by else str(found["verdict"])
+
+
 def _row(found: dict[str, Any]) -> Row:
     shares = (found[name] for name in ("error", "uncertainty", "estimated_error"))
     seconds = "" if found["seconds"] is None else duration(found["seconds"])
-    return found["name"], found["verdict"], *("" if s is None else percent(s) for s in shares), seconds
+    return found["name"], verdict_words(found), *("" if s is None else percent(s) for s in shares), seconds
