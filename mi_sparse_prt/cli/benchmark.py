@@ -125,15 +125,15 @@ def benchmark(
         parameters, progress = options.definitions(define), not quiet
         with command.prompt_interrupts():
             measure, show = _measurement(which, repeats, method or [])
-            if which == "--zoo":
+            if scene is None or zoo:
                 command.report = measure(scene, progress, figures)
             elif which == "--sizes":
                 command.report = measure(scene, parameters, progress, figures)
             else:
-                assert scene is not None
                 case = prt.load_scene(scene, edge_length, **parameters), prt.CubemapLighting(resolution)
-                drawn = {} if figures is None else {"figures": figures}
-                command.report = measure(*case, progress=progress, **drawn)
+                command.report = measure(
+                    *case, progress=progress, **({"figures": figures} if figures else {})
+                )
         if figures is not None:
             command.written.append(figures)
         command.show(*show(command.report))
