@@ -9,6 +9,7 @@ from mi_sparse_prt.benchmark.row_column_choices import measure_choices
 from mi_sparse_prt.benchmark.size_costs import cost_against_size
 from mi_sparse_prt.benchmark.speed import run_benchmark
 from mi_sparse_prt.benchmark.time_error import time_against_error
+from mi_sparse_prt.benchmark.zoo import measure_zoo
 
 __all__ = [
     "cost_against_size",
@@ -18,6 +19,7 @@ __all__ = [
     "measure_glossy",
     "measure_methods",
     "measure_plans",
+    "measure_zoo",
     "run_benchmark",
     "save_gallery",
     "time_against_error",

@@ -52,17 +52,31 @@ Cpca = Annotated[
 Glossy = Annotated[
     bool, typer.Option("--glossy", help="Measure view-dependent transport of glossy surfaces instead.")
 ]
+Zoo = Annotated[
+    bool,
+    typer.Option(
+        "--zoo",
+        help="Render a small scene for each of Mitsuba's plugins instead, and say which come out right.",
+    ),
+]
 Figures = Annotated[
     Path | None,
     options.file_option(
         metavar="FOLDER",
-        help="Draw what --method, --choices, --time-error, --sizes, --cpca or --glossy measures: PNG files there.",
+        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy or --zoo measures: "
+        "PNG files there.",
+    ),
+]
+Place = Annotated[
+    Path | None,
+    options.file_argument(
+        "[SCENE]", "Mitsuba scene, an XML file; --zoo takes a folder of them, or none for its own."
     ),
 ]
 
 
 def benchmark(
-    scene: options.SceneFile,
+    scene: Place = None,
     resolution: options.Resolution = options.DEFAULT_RESOLUTION,
     repeats: Repeats = 3,
     method: Methods = None,
@@ -72,6 +86,7 @@ def benchmark(
     sizes: Sizes = False,
     cpca: Cpca = False,
     glossy: Glossy = False,
+    zoo: Zoo = False,
     figures: Figures = None,
     edge_length: options.EdgeLength = None,
     define: options.Define = None,
@@ -87,7 +102,7 @@ def benchmark(
     With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
     With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
     With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
-    images, its Figures 17 to 19.
+    images, its Figures 17 to 19. With --zoo --figures FOLDER: what is compatible, beside Mitsuba's path.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -99,28 +114,43 @@ def benchmark(
         "--sizes": sizes,
         "--cpca": cpca,
         "--glossy": glossy,
+        "--zoo": zoo,
     }
     which = _only_one(asked)
-    if figures is not None and which in WITHOUT_FIGURES:
-        others = ", ".join(name for name in asked if name not in WITHOUT_FIGURES)
-        raise typer.BadParameter(f"there are figures of {others} only", param_hint="--figures")
-    if sizes and (edge_length is not None or resolution != options.DEFAULT_RESOLUTION):
-        raise typer.BadParameter("it varies --edge-length and --resolution itself", param_hint="--sizes")
+    varied = edge_length is not None or resolution != options.DEFAULT_RESOLUTION or (zoo and bool(define))
+    _check(which, scene, varied, figures is not None)
     with running(json_file, quiet) as command:
         if figures is not None:
             check_folder(figures)
         parameters, progress = options.definitions(define), not quiet
         with command.prompt_interrupts():
             measure, show = _measurement(which, repeats, method or [])
-            if sizes:
+            if scene is None or zoo:
+                command.report = measure(scene, progress, figures)
+            elif which == "--sizes":
                 command.report = measure(scene, parameters, progress, figures)
             else:
                 case = prt.load_scene(scene, edge_length, **parameters), prt.CubemapLighting(resolution)
-                drawn = {} if figures is None else {"figures": figures}
-                command.report = measure(*case, progress=progress, **drawn)
+                command.report = measure(
+                    *case, progress=progress, **({"figures": figures} if figures else {})
+                )
         if figures is not None:
             command.written.append(figures)
         command.show(*show(command.report))
+
+
+def _check(which: str, scene: Path | None, varied: bool, drawn: bool) -> None:
+    """Refuse arguments that do not go with what is to be measured (typer.BadParameter).
+
+    ``varied``: vertices, texels or values for the scene are asked for; ``drawn``: figures are.
+    """
+    if scene is None and which != "--zoo":
+        raise typer.BadParameter("only --zoo can do without one", param_hint="SCENE")
+    if drawn and which in WITHOUT_FIGURES:
+        raise typer.BadParameter(f"there are none of {which or 'speed alone'}", param_hint="--figures")
+    if varied and which in ("--sizes", "--zoo"):
+        own = "it chooses --edge-length and --resolution itself"
+        raise typer.BadParameter(f"{own}, and takes no -D" if which == "--zoo" else own, param_hint=which)
 
 
 def _only_one(asked: dict[str, bool]) -> str:
@@ -139,6 +169,7 @@ def _measurement(
     from mi_sparse_prt.cli.tables import benchmark as tables
     from mi_sparse_prt.cli.tables.choices import choices_tables
     from mi_sparse_prt.cli.tables.methods import methods_tables
+    from mi_sparse_prt.cli.tables.zoo import zoo_tables
 
     kinds: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[dict[str, Any]], list[Table]]]] = {
         "": (partial(benchmarks.run_benchmark, repeats=repeats), tables.benchmark_tables),
@@ -152,5 +183,6 @@ def _measurement(
         "--sizes": (benchmarks.cost_against_size, tables.sizes_tables),
         "--cpca": (benchmarks.measure_cpca, tables.cpca_tables),
         "--glossy": (benchmarks.measure_glossy, tables.glossy_tables),
+        "--zoo": (benchmarks.measure_zoo, zoo_tables),
     }
     return kinds[which]
