@@ -10,7 +10,7 @@ Light that goes straight through (masks, thin panes, ``null``) needs no random r
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -53,7 +53,7 @@ class SpecularOptions:
     negligible : float
         Noise relative to light that nothing blocks, L2, that is good enough as well.
     strata : int
-        Texel basis: rays per axis of a texel, for light that goes straight on and of which a part is lost.
+        Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
 
     first: int = 2
@@ -292,24 +292,54 @@ def specular_light(
     walks, albedo = SpecularRays(problem), problem.reflection.albedo[every]
     seeds = iter(element_seeds(random_stream(seed, SPECULAR), 64))
     rows, parts = walks.parts_that_see(every, next(seeds))
-    texels = problem.emission.size
-    traced, strata, free = len(every) * PARTS**2, options.first, _unblocked(problem, albedo)
-    passed = _passed_twice(problem, every, options.strata, next(seeds), next(seeds))
-    while True:
-        halves = [
-            [light + straight for light in _sampled(walks, every, (rows, parts), strata, next(seeds), texels)]
-            for straight in passed
-        ]
-        traced += 2 * len(rows) * strata**2
-        square, noise = _compared(halves, albedo)
-        enough = noise <= max(options.noise**2 * square, options.negligible**2 * free)
-        if enough or strata >= options.last:
-            break
-        strata *= 2
-    mean = [(a + b) * np.float32(0.5) for a, b in zip(*halves, strict=True)]
+    free = options.negligible**2 * _unblocked(problem, albedo)
+
+    def arriving(strata: int) -> list[list[Sparse]]:
+        where = rows, parts
+        return [_sampled(walks, every, where, strata, next(seeds), problem.emission.size) for _ in "ab"]
+
+    def passing(strata: int) -> list[list[Sparse]]:
+        return [[half] * 3 for half in _passed_twice(problem, every, strata, next(seeds), next(seeds))]
+
+    found = [
+        _refined(passing, options.strata, albedo, (options.noise, free / 2)),
+        _refined(arriving, options.first, albedo, (options.noise, free / 2), options.last),
+    ]
+    traced = len(every) * PARTS**2 + 2 * len(rows) * sum(s**2 for s in found[1].strata)
+    mean = [
+        (a + b + c + d) * np.float32(0.5)
+        for (a, b), (c, d) in zip(*(zip(*part.halves, strict=True) for part in found), strict=True)
+    ]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
     operator = SparseRows(tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean)))
+    square, noise = (sum(x) for x in zip(*((part.square, part.noise) for part in found), strict=True))
     return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), traced)
+
+
+class _Refined(NamedTuple):
+    """Two halves, each of three channels; the squared norms of radiance and noise, and the strata that were tried."""
+
+    halves: list[list[Sparse]]
+    square: float
+    noise: float
+    strata: list[int]
+
+
+def _refined(
+    sample: Callable[[int], list[list[Sparse]]],
+    first: int,
+    albedo: NDArray[np.float32],
+    enough: tuple[float, float],
+    last: int = 8,
+) -> _Refined:
+    """Sample with twice the strata each time, until noise is small: relative, or its square as it is."""
+    tried = [first]
+    while True:
+        halves = sample(tried[-1])
+        square, noise = _compared(halves, albedo)
+        if noise <= max(enough[0] ** 2 * square, enough[1]) or tried[-1] >= last:
+            return _Refined(halves, square, noise, tried)
+        tried.append(2 * tried[-1])
 
 
 def _passed_twice(problem: Problem, ids: Ids, strata: int, *seeds: int) -> list[Sparse]:

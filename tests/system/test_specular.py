@@ -7,6 +7,7 @@ import pytest
 from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
@@ -31,7 +32,7 @@ def objects(albedo: float) -> dict:
 
     return {
         "floor": {**FLOOR, "bsdf": grey},
-        "wall": {"type": "rectangle", "to_world": T().translate([0, 0.8, -1.6]), "bsdf": grey},
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 1, -1.5]), "bsdf": grey},
         "mirror": {"type": "sphere", "center": [-0.8, 0.5, 0], "radius": 0.4, "bsdf": {"type": "conductor"}},
         "glass": {"type": "sphere", "center": [0, 0.5, 0.3], "radius": 0.35, "bsdf": {"type": "dielectric"}},
         "sheet": card(0.9, 0.5, 0, {"type": "mask", "opacity": 0.5, "bsdf": twosided(grey)}),
@@ -48,11 +49,12 @@ def objects(albedo: float) -> dict:
 def test_furnace():
     """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
 
-    Expected: every diffuse mesh has a mean irradiance of 1 within 1%, of which the parts that are new are 2% and more:
+    Expected: every diffuse mesh has a mean irradiance of 1 within 1% (4% of few vertices), of which the parts that are new are 2% and more:
     without what arrives by mirrors and glass, or without what they send from surface to surface, it is less.
     """
-    scene, lighting = build(0.12, **objects(1.0)), prt.CubemapLighting(4)
-    transport = prt.precompute(scene, lighting, "gather", basis="texel", max_depth=-1, progress=False)
+    scene, lighting = build(0.15, **objects(1.0)), prt.CubemapLighting(4)
+    plan = Plan("exact", "gather", 256, 0.02)
+    transport = prt.precompute(scene, lighting, plan, "texel", -1, strata=4, progress=False)
     light = np.ones((lighting.n_directions, 3), np.float32)
     irradiance = transport.irradiance(light).mean(axis=1)
     specular = transport.operators["specular"].relight(light).mean(axis=1)
@@ -60,7 +62,8 @@ def test_furnace():
         if scene.albedo[mesh.vertices].any():
             mean, part = (float(x[mesh.vertices].mean()) for x in (irradiance, specular))
             print(f"{mesh.name}: {mean:.4f}, of which {part:.4f} by way of mirrors and glass")
-            assert mean == pytest.approx(1, abs=0.01)
+            few = mesh.vertices.stop - mesh.vertices.start < 200
+            assert mean == pytest.approx(1, abs=0.04 if few else 0.01)
     assert specular[scene.meshes[0].vertices].mean() > 0.05
 
 
@@ -87,13 +90,13 @@ def test_gathered_light_is_that_of_paths():
 
 def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
-    scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
+    scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
     problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
     ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
     exact = specular_light(problem, 9, SpecularOptions(8, 8, strata=8)).operator.rows(ids) * power
     noises = []
     for strata in (1, 2):
-        found = specular_light(problem, 4, SpecularOptions(strata, strata))
+        found = specular_light(problem, 4, SpecularOptions(strata, strata, strata=4))
         true = np.linalg.norm(found.operator.rows(ids) * power - exact) / np.linalg.norm(exact)
         print(f"{strata}: told {found.noise:.3f}, true {true:.3f}, {found.rays} rays")
         assert found.noise == pytest.approx(true, rel=0.2)
