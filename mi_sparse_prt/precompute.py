@@ -172,8 +172,7 @@ class _Attempts:
         specular = None
         if self._dark is None and self._problem.specular_apart:
             with run.clock.phase("specular"):
-                good_enough = (settings.target_error or TARGET) / 4
-                options = SpecularOptions(negligible=good_enough)
+                options = SpecularOptions(error=(settings.target_error or TARGET) / 1.5)
                 specular = specular_light(self._problem, run.seed, options)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)

@@ -10,6 +10,7 @@ Light that goes straight through (masks, thin panes, ``null``) needs no random r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -31,7 +32,9 @@ from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, s
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
+FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
 PARTS = 16  # of a hemisphere, per axis
+DIRECT = 1 / 3  # of the squared norm of light that nothing blocks: a guess of what direct light has
 MOST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 SPECULAR = 7  # spawn key
 
@@ -47,19 +50,16 @@ class SpecularOptions:
     first : int
         Strata per axis of a part of the hemisphere, each with a ray, in each of two independent halves.
     last : int
-        At most; there are twice as many each time, until the noise is small enough.
-    noise : float
-        Relative L2 of all specular light that is good enough.
-    negligible : float
-        Noise relative to light that nothing blocks, L2, that is good enough as well.
+        At most; there are more each time, until the noise is small enough.
+    error : float
+        Noise that is small enough: relative L2, of direct and specular light together.
     strata : int
         Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
 
     first: int = 2
     last: int = 16
-    noise: float = 0.1
-    negligible: float = 0.003
+    error: float = 0.0
     strata: int = 2
 
 
@@ -89,6 +89,15 @@ class _Found(NamedTuple):
     weights: NDArray[np.float32]
 
 
+class _Ends(NamedTuple):
+    """Ends of rays on the device: rows, columns and weights, as far as they are valid."""
+
+    row: Any
+    column: Any
+    weight: Any
+    valid: Any
+
+
 class SpecularRays:
     """Rays from points that go on where they meet specular surfaces.
 
@@ -101,7 +110,7 @@ class SpecularRays:
     def __init__(self, problem: Problem) -> None:
         self._scene, self._surfaces = problem.scene.normalised, Surfaces(problem.scene)
         self._points = PointArrays(problem.points)
-        self._resolution = problem.emission.resolution
+        self._resolution, self._texels = problem.emission.resolution, problem.emission.size
         self._most = most_on_the_way(problem.max_depth)
 
     def parts_that_see(self, ids: Ids, seed: int) -> tuple[Ids, Ids]:
@@ -119,15 +128,15 @@ class SpecularRays:
             some = ids[a : a + LANES // PARTS**2]
             rows, parts = (x.ravel() for x in np.indices((len(some), PARTS**2)))
             ray, _, _ = self._rays(some, rows, parts, 1, seed)
-            seen = self._is_specular(ray).numpy().reshape(-1, PARTS, PARTS)
+            seen = self._specular_hits(ray)[1].numpy().reshape(-1, PARTS, PARTS)
             grown = scipy.ndimage.maximum_filter(seen, (1, 3, 3))
             row, part = np.nonzero(grown.reshape(len(some), -1))
             found.append((a + row, part))
         rows, parts = (np.concatenate(x) for x in zip(*found, strict=True))
         return rows, parts
 
-    def sky(self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int) -> _Found:
-        """Texels to which rays from points leave the scene, but for those that went straight all the way.
+    def sky(self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int) -> NDArray[np.float32]:
+        """Light of texels to which rays from points leave the scene, but for those that went straight all the way.
 
         Parameters
         ----------
@@ -141,16 +150,20 @@ class SpecularRays:
 
         Returns
         -------
-        _Found
-            Weights are those of unit-albedo transport.
+        (3, n, n_directions) float32
+            Unit-albedo transport.
         """
         ray, row, rng = self._rays(ids, rows, parts, strata, seed)
-        found = [
-            _Found(*(x[~hits] for x in (rows, columns, weights)))
-            for rows, columns, weights, hits in self._walked(ray, row, rng)
-        ]
-        rows, columns, weights = _joined(found)
-        return _Found(rows, columns, weights / np.float32((PARTS * strata) ** 2))
+        size = len(ids) * self._texels
+        sums = [dr.zeros(mi.UInt32, size) for _ in range(3)]
+        scale = FIXED_POINT / (PARTS * strata) ** 2  # whole numbers: sums do not depend on the order of rays
+        for ends in self._walked(ray, row, rng, True):
+            place = ends.row * self._texels + ends.column
+            for c, total in enumerate(sums):
+                share = mi.UInt32(ends.weight[c] * dr.opaque(mi.Float, scale) + 0.5)
+                dr.scatter_reduce(dr.ReduceOp.Add, total, share, place, ends.valid)
+        shape = len(ids), self._texels
+        return np.stack([(total.numpy() / np.float32(FIXED_POINT)).reshape(shape) for total in sums])
 
     def surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> _Found:
         """Vertices of the surfaces that cosine-distributed rays from some points meet after specular ones."""
@@ -159,9 +172,11 @@ class SpecularRays:
         row = lane // len(samples[0])
         rng = random_generator(self._points.key(point), lane - row * len(samples[0]), mi.UInt32(1), seed)
         found = []
-        for depth, (rows, columns, weights, hits) in enumerate(self._walked(ray, row, rng), 1):
-            if depth < self._most:  # light of that surface makes one more bounce
-                found.append(_Found(*(x[hits] for x in (rows, columns, weights))))
+        for depth, ends in enumerate(self._walked(ray, row, rng, False), 1):
+            if depth < self._most:  # light of a surface at the end makes one more bounce
+                kept = ends.valid.numpy()
+                arrays = ends.row.numpy(), ends.column.numpy(), ends.weight.numpy().T
+                found.append(_Found(*(x[kept] for x in arrays)))
         rows, columns, weights = _joined(found)
         return _Found(rows, columns, weights / np.float32(len(samples[0])))
 
@@ -182,20 +197,21 @@ class SpecularRays:
         direction = mi.Frame3f(self._points.normal(point)).to_world(local)
         return start_ray(self._points, point, direction), row, rng
 
-    def _is_specular(self, ray: mi.Ray3f) -> mi.Mask:
-        """Whether rays meet what scatters light into single directions."""
+    def _specular_hits(self, ray: mi.Ray3f) -> tuple[mi.PreliminaryIntersection3f, mi.Mask]:
+        """What rays meet, and whether that scatters light into single directions."""
         hit = self._scene.ray_intersect_preliminary(ray)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
-        return hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
+        return hit, hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
 
-    def _walked(self, ray: mi.Ray3f, row: mi.UInt32, rng: mi.PCG32) -> Iterator[tuple[Any, ...]]:
-        """After each specular surface: rows, columns, weights, and whether columns are vertices, not texels."""
+    def _walked(self, ray: mi.Ray3f, row: mi.UInt32, rng: mi.PCG32, to_sky: bool) -> Iterator[_Ends]:
+        """Rays that end after one specular surface, after two, ...: at texels of the sky, or at vertices."""
         context = mi.BSDFContext()
         context.type_mask = int(mi.BSDFFlags.Delta)
-        index = dr.compress(self._is_specular(ray))  # few of them
-        ray, row, rng = (dr.gather(type(x), x, index) for x in (ray, row, rng))
+        hit, met = self._specular_hits(ray)
+        dr.eval(hit, met, ray, row, rng)
+        index = dr.compress(met)  # few of them
+        ray, row, rng, hit = (dr.gather(type(x), x, index) for x in (ray, row, rng, hit))
         weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
-        hit = self._scene.ray_intersect_preliminary(ray)
         for _ in range(self._most):
             if len(index) == 0:
                 return
@@ -209,19 +225,15 @@ class SpecularRays:
             ray = si.spawn_ray(si.to_world(scattered.wo))
             hit = self._scene.ray_intersect_preliminary(ray, active=goes_on)
             valid = hit.is_valid()
-            vertex = self._surfaces.corner(hit, ray.d, rng.next_float32())
-            texel = texel_at(*face_coordinates(ray.d), self._resolution)
-            column = dr.select(valid, vertex, dr.select(straight, NOTHING, texel))
+            if to_sky:
+                texel = texel_at(*face_coordinates(ray.d), self._resolution)
+                column = dr.select(valid | straight, NOTHING, texel)
+            else:
+                column = dr.select(valid, self._surfaces.corner(hit, ray.d, rng.next_float32()), NOTHING)
             ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
             alive = goes_on & valid & (dr.max(weight) > 0)
-            dr.eval(row, column, weight, ends, valid, alive, ray, rng, straight, hit)
-            kept = ends.numpy()
-            yield (
-                row.numpy()[kept].astype(np.int64),
-                column.numpy()[kept].astype(np.int64),
-                weight.numpy().T[kept],
-                valid.numpy()[kept],
-            )
+            dr.eval(row, column, weight, ends, alive, ray, rng, straight, hit)
+            yield _Ends(row, column, weight, ends)
             index = dr.compress(alive)
             row, weight, straight, ray, rng, hit = (
                 dr.gather(type(x), x, index) for x in (row, weight, straight, ray, rng, hit)
@@ -292,7 +304,7 @@ def specular_light(
     walks, albedo = SpecularRays(problem), problem.reflection.albedo[every]
     seeds = iter(element_seeds(random_stream(seed, SPECULAR), 64))
     rows, parts = walks.parts_that_see(every, next(seeds))
-    free = options.negligible**2 * _unblocked(problem, albedo)
+    enough = options.error**2 / 2, options.error**2 / 2 * DIRECT * _unblocked(problem, albedo)
 
     def arriving(strata: int) -> list[list[Sparse]]:
         where = rows, parts
@@ -302,8 +314,8 @@ def specular_light(
         return [[half] * 3 for half in _passed_twice(problem, every, strata, next(seeds), next(seeds))]
 
     found = [
-        _refined(passing, options.strata, albedo, (options.noise, free / 2)),
-        _refined(arriving, options.first, albedo, (options.noise, free / 2), options.last),
+        _refined(passing, options.strata, albedo, enough),
+        _refined(arriving, options.first, albedo, enough, options.last),
     ]
     traced = len(every) * PARTS**2 + 2 * len(rows) * sum(s**2 for s in found[1].strata)
     mean = [
@@ -332,14 +344,17 @@ def _refined(
     enough: tuple[float, float],
     last: int = 8,
 ) -> _Refined:
-    """Sample with twice the strata each time, until noise is small: relative, or its square as it is."""
+    """Sample with more strata each time, until squared noise is below a factor times the squared norm, and a number."""
     tried = [first]
     while True:
         halves = sample(tried[-1])
         square, noise = _compared(halves, albedo)
-        if noise <= max(enough[0] ** 2 * square, enough[1]) or tried[-1] >= last:
+        limit = enough[0] * square + enough[1]
+        if noise <= limit or tried[-1] >= last:
             return _Refined(halves, square, noise, tried)
-        tried.append(2 * tried[-1])
+        # between 1 / strata, as of rays at random, and its square, as of smooth light
+        wanted = tried[-1] * (noise / max(limit, 1e-30)) ** (0.5 / 1.25)
+        tried.append(min(last, max(tried[-1] + 1, math.ceil(min(wanted, 3 * tried[-1])))))
 
 
 def _passed_twice(problem: Problem, ids: Ids, strata: int, *seeds: int) -> list[Sparse]:
@@ -355,14 +370,30 @@ def _sampled(
     walks: SpecularRays, points: Ids, where: tuple[Ids, Ids], strata: int, seed: int, size: int
 ) -> list[Sparse]:
     """Light (points, size) of each channel, from rays into parts of hemispheres."""
-    shape, step = (len(points), size), max(1, LANES // strata**2)
-    sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
-    for a in range(0, len(where[0]), step):
-        some = [x[a : a + step] for x in where]
-        rows, columns, weights = walks.sky(points, some[0], some[1], strata, seed)
-        for c in range(3):
-            sums[c] = sums[c] + scipy.sparse.coo_array((weights[:, c], (rows, columns)), shape=shape).tocsr()
-    return sums
+    lit, starts = np.unique(where[0], return_index=True)  # rows are sorted
+    ends = np.append(starts[1:], len(where[0]))
+    found: list[list[Sparse]] = [[], [], []]
+    first = 0
+    while first < len(lit):
+        room = LANES // strata**2 + starts[first], first + max(1, LANES // size)
+        last = max(first + 1, min(int(np.searchsorted(ends, room[0], side="right")), room[1]))
+        some = slice(starts[first], ends[last - 1])
+        rows = np.searchsorted(lit[first:last], where[0][some])
+        dense = walks.sky(points[lit[first:last]], rows, where[1][some], strata, seed)
+        for channel, part in zip(found, dense, strict=True):
+            channel.append(scipy.sparse.csr_array(part))
+        first = last
+    counts = np.zeros(len(points), np.int64)
+    none = scipy.sparse.csr_array((len(points), size), dtype=np.float32)
+    result = []
+    for channel in found if len(lit) else []:
+        together = scipy.sparse.vstack(channel, format="csr")
+        counts[lit] = np.diff(together.indptr)
+        starts_of_rows = np.concatenate([[0], np.cumsum(counts)])
+        result.append(
+            scipy.sparse.csr_array((together.data, together.indices, starts_of_rows), shape=none.shape)
+        )
+    return result or [none] * 3
 
 
 def _compared(halves: list[list[Sparse]], albedo: NDArray[np.float32]) -> tuple[float, float]:

@@ -6,7 +6,8 @@ from conftest import COLOURS, GREY, build, problem_at, still_life
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.metrics import relative_l2
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.solvers.paths import PathSolver
 
@@ -119,11 +120,21 @@ def test_without_interreflections_it_is_direct_light(scene):
         assert "gather" not in transport.report["rays"]
 
 
-def test_other_materials_are_refused_by_name():
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_other_materials_count_as_diffuse_and_the_error_is_told():
+    """Expected: the estimate is what rows of paths, which ask the real BSDF, differ by."""
     shapes = still_life()
-    shapes["box"]["bsdf"] = {"type": "roughconductor"}
-    with pytest.raises(PrtError, match="diffuse"):
-        prt.precompute(build(0.5, **shapes), LIGHTING, method="gather", progress=False)
+    shapes["box"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    scene = build(0.5, **shapes)
+    ours, exact = (
+        prt.precompute(scene, prt.CubemapLighting(4), plan, progress=False)
+        for plan in (Plan("exact", "gather", 1024, 0.01), Plan("exact", "paths", spp=1024))
+    )
+    rows = np.arange(scene.n_vertices)
+    true = relative_l2(ours.rows(rows), exact.rows(rows))
+    told = ours.report["estimated_error"]
+    print(f"true {true:.3%}, told {told['total']:.3%} +- {told['standard_error']['total']:.3%}")
+    assert abs(told["total"] - true) < 4 * told["standard_error"]["total"] + 0.1 * true
 
 
 def test_same_seed_same_matrix(scene, gathered):

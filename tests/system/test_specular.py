@@ -49,8 +49,8 @@ def objects(albedo: float) -> dict:
 def test_furnace():
     """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
 
-    Expected: every diffuse mesh has a mean irradiance of 1 within 1% (4% of few vertices), of which the parts that are new are 2% and more:
-    without what arrives by mirrors and glass, or without what they send from surface to surface, it is less.
+    Expected: the mean irradiance of every diffuse mesh is 1 within 1% (4% of few vertices), of which 5% and more arrive
+    by mirrors and glass; without that, or without what these send from surface to surface, it is less.
     """
     scene, lighting = build(0.15, **objects(1.0)), prt.CubemapLighting(4)
     plan = Plan("exact", "gather", 256, 0.02)

@@ -159,10 +159,6 @@ def test_blocks_change_nothing_and_share_a_kernel(grey_scene, monkeypatch):
 
 
 def test_what_cannot_be_gathered_is_refused():
-    with pytest.warns(prt.PrtWarning, match="is not diffuse"):
-        scene = build(shape={"type": "cube"}, ball={"type": "sphere", "bsdf": {"type": "plastic"}})
-    with pytest.raises(PrtError, match="'ball' is not diffuse"):
-        solver(scene)
     with pytest.raises(PrtError, match="100 is not a power of two"):
         solver(build(shape={"type": "cube"}), rays=100)
 
