@@ -125,7 +125,8 @@ def validate(
     Raises
     ------
     PrtError
-        If the matrix belongs to another scene, or its pixels to another camera.
+        If the matrix belongs to another scene, or its pixels to another camera; or if it is of single directions, in a
+        scene of mirrors, glass or masks, in which Mitsuba's directional lights do not shine as environments do.
 
     Notes
     -----
@@ -140,6 +141,7 @@ def validate(
     )
 
     transport = transport.for_scene(scene)
+    left_out = _left_out(scene, transport)
     rng = np.random.default_rng([seed, 2])
     rows = _chosen_rows(scene, transport, n_rows, sensor, rng)
     elements = _stratified(transport.shape[1], n_columns, rng)
@@ -158,6 +160,7 @@ def validate(
     report = matrix_errors(moved, halves[0], halves[1], rows.ids, elements, rows.groups, names)
     report |= at_hits
     report["estimated_error"] = transport.report.get("estimated_error")
+    report["left_out"] = left_out
     report["missed_vertices"] = 0 if rows.rays is None else int(rows.rays.missed.sum())
     report["parameters"] = {"rows": len(rows.ids), "columns": len(elements), "spp": spp, "seed": seed}
     figures = {"errors": draw.errors(moved, (halves[0] + halves[1]) / 2, rows.ids, rows.groups)}
@@ -182,11 +185,31 @@ class _Rows:
     camera: mi.Sensor | None = None
 
 
+def _left_out(scene: Scene, transport: LightTransport) -> list[str]:
+    """Sentences about rows that Mitsuba's renders cannot be compared with.
+
+    Raises
+    ------
+    PrtError
+        If that is so of all columns.
+    """
+    if "specular" in transport.operators and transport.basis == "direction":
+        raise PrtError(
+            "Mitsuba's directional lights do not shine through glass and masks, nor by way of mirrors: "
+            'validate a matrix of basis="texel"'
+        )
+    names = [k.name for k in scene.materials[: len(scene.fronts)] if k.single_directions]
+    if not names or transport.measurement.kind != "vertices":
+        return []
+    return [f"rows of mirrors, glass and masks, whose radiance comes from other places: {', '.join(names)}"]
+
+
 def _chosen_rows(
     scene: Scene, transport: LightTransport, n_rows: int, sensor: int | mi.Sensor, rng: np.random.Generator
 ) -> _Rows:
     if transport.measurement.kind == "vertices":
-        ids = _stratified_vertices(transport.meshes, n_rows, rng)
+        seen = [m for m, k in zip(transport.meshes, scene.materials, strict=True) if not k.single_directions]
+        ids = _stratified_vertices(tuple(seen) or transport.meshes, n_rows, rng)
         return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised, scene))
     if transport.measurement.image is None:
         raise PrtError(f"validate renders vertices and pixels, not {transport.measurement.kind!r}")
