@@ -34,6 +34,7 @@ from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.specular_terms import with_term_rows
 from mi_sparse_prt.transport import LightTransport
 
 FACTOR_SHARE = 0.5  # of the target error, which the factors of BRDFs may have; a quarter of its square
@@ -162,7 +163,7 @@ def precompute(
         return _lit_by_lamps(problem, settings, run)
     with run.clock.phase("setup"):
         seen, settings = _reflection(scene, where, settings)
-        apart = scene.specular and not seen.terms and where.kind == "vertices" and max_depth != 2
+        apart = scene.specular and where.kind == "vertices" and max_depth != 2
         problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
@@ -180,6 +181,8 @@ class _Attempts:
                 good_enough = (settings.target_error or TARGET) / 4
                 options = SpecularOptions(negligible=good_enough)
                 specular = specular_light(self._problem, run.seed, options)
+                if self._problem.reflection.terms:
+                    specular = with_term_rows(self._problem, specular, run.seed)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
         self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
