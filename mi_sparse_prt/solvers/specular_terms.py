@@ -121,13 +121,16 @@ def _weights(lobes: Lobes, point: mi.UInt32, direction: mi.Vector3f) -> Floats:
 
 def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
     """Light as a matrix (points * K, texels) of each channel."""
-    terms = found.into.shape[1]
-    rows = (found.rows[:, None] * terms + np.arange(terms)).ravel()
-    columns = np.repeat(found.texels, terms)
-    values = found.into[:, :, None] * found.light[:, None]  # [end, term, channel]
-    return [
-        scipy.sparse.coo_array((values[..., c].ravel(), (rows, columns)), shape=shape)
-        .tocsr()
-        .astype(np.float32)
-        for c in range(3)
-    ]
+    count, terms = found.into.shape
+    columns = (found.rows[:, None] * terms + np.arange(terms)).ravel()
+    starts = np.arange(0, count * terms + 1, terms)
+    into = scipy.sparse.csr_array((found.into.ravel(), columns, starts), shape=(count, shape[0]))
+    into = scipy.sparse.csr_array(into.T)  # [term of a point, end]
+    grey = bool((found.light == found.light[:, :1]).all())
+    matrices = []
+    for light in found.light.T[: 1 if grey else 3]:
+        ends = scipy.sparse.csr_array(
+            (np.ascontiguousarray(light), found.texels, np.arange(count + 1)), shape=(count, shape[1])
+        )
+        matrices.append(scipy.sparse.csr_array(into @ ends).astype(np.float32))
+    return matrices * 3 if grey else matrices

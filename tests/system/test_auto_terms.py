@@ -35,18 +35,22 @@ def ball(x: float, bsdf: dict, z: float = 0.0) -> dict:
     return {"type": "sphere", "center": [x, 0.45, z], "radius": 0.4, "bsdf": bsdf}
 
 
-def scene_of(**shapes: dict) -> prt.Scene:
+def scene_of(edge_length: float = 0.1, **shapes: dict) -> prt.Scene:
     """Shapes over a grey ground, under the sky, with a camera."""
-    ground = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": diffuse(0.5, 0.5, 0.5)}
+    ground = {
+        "type": "rectangle",
+        "to_world": T().rotate([1, 0, 0], -90).scale(2),
+        "bsdf": diffuse(0.5, 0.5, 0.5),
+    }
     light = {"type": "cubemap", "data": mi.TensorXf(sky())}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", prt.PrtWarning)
-        return build(0.1, ground=ground, sky=light, camera=CAMERA, **shapes)
+        return build(edge_length, ground=ground, sky=light, camera=CAMERA, **shapes)
 
 
 def image_error(scene: prt.Scene, *transports: prt.LightTransport) -> list[tuple[float, float]]:
     """Of each matrix, the image's relative L2 beyond noise against ``path``, and what noise may show as one."""
-    halves = [path_image(scene.mitsuba, scene.mitsuba.sensors()[0], 4, 1024, seed) for seed in (1, 2)]
+    halves = [path_image(scene.mitsuba, scene.mitsuba.sensors()[0], 4, 2048, seed) for seed in (1, 2)]
     pairs = [[prt.render(scene, t, sky(), spp=64, seed=seed) for seed in (3, 4)] for t in transports]
     return [relative_l2_without_noise(a, *halves, other_estimate=b) for a, b in pairs]
 
@@ -72,7 +76,7 @@ def test_rough_conductor(artefact):
     Rationale: a rough metal ball as large as a third of the image, taken for diffuse, is far off.
     Expected: within 3% of ``path``, and under a third of the error of the diffuse one.
     """
-    scene = scene_of(ball=ball(0, BRUSHED))
+    scene = scene_of(0.15, ball=ball(0, BRUSHED))
     (diffuse_error, _), (error, uncertainty) = image_error(scene, computed(scene, 0), computed(scene, "auto"))
     print(f"diffuse {diffuse_error:.2%}, auto {error:.2%} (noise may show {uncertainty:.2%})")
     assert uncertainty < 0.015
@@ -89,7 +93,12 @@ def test_beside_mirror_and_mask():
     """
     half = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "bsdf": diffuse(0.6, 0.6, 0.6)}}
     sheet = {"type": "rectangle", "to_world": T().translate([0.1, 0.5, 0.75]).scale(0.35), "bsdf": half}
-    scene = scene_of(metal=ball(0.1, BRUSHED), mirror=ball(-0.85, {"type": "conductor"}), sheet=sheet)
+    mirror = {
+        "type": "rectangle",
+        "to_world": T().look_at([-0.8, 0.45, 0], [0.5, 0.3, 1.5], [0, 1, 0]).scale(0.45),
+        "bsdf": {"type": "conductor"},
+    }
+    scene = scene_of(0.2, metal=ball(0.1, BRUSHED), mirror=mirror, sheet=sheet)
     transport = computed(scene, "auto")
     assert transport.terms > 1
     named = {mesh.name: transport.reflection.material[mesh.vertices] for mesh in transport.meshes}
@@ -104,7 +113,7 @@ def test_what_cannot_be_factored_is_named(tmp_path):
     """By the integrator, whose default it is: one warning, an image, and the metal beside it has its factors."""
     weight = {"type": "checkerboard", "to_uv": T().scale(4)}
     blend = {"type": "blendbsdf", "weight": weight, "metal": BRUSHED, "paint": diffuse(0.5, 0.1, 0.1)}
-    scene = scene_of(metal=ball(0.4, BRUSHED), quilt=ball(-0.5, blend))
+    scene = scene_of(0.3, metal=ball(0.4, BRUSHED), quilt=ball(-0.5, blend))
     integrator = mi.load_dict(
         {"type": "sparse_prt", "resolution": 4, "max_depth": 2, "cache": str(tmp_path), "progress": False}
     )
@@ -113,7 +122,9 @@ def test_what_cannot_be_factored_is_named(tmp_path):
         image = np.array(mi.render(scene.mitsuba, integrator=integrator, spp=4))
     said = [str(w.message) for w in caught if "diffuse" in str(w.message)]
     assert len(said) == 1
-    assert "'quilt' (BlendBSDF varies over the surface" in said[0] and "estimated error does not know" in said[0]
+    assert (
+        "'quilt' (BlendBSDF varies over the surface" in said[0] and "estimated error does not know" in said[0]
+    )
     assert np.isfinite(image).all() and image.mean() > 0.1
     (file,) = tmp_path.glob("*.prt")
     assert prt.load_transport(file).terms > 1
@@ -122,7 +133,7 @@ def test_what_cannot_be_factored_is_named(tmp_path):
 def test_methods_without_terms_fall_back():
     """With a warning in place of the error that a number of terms leads to."""
     with pytest.warns(prt.PrtWarning):
-        scene = build(0.5, ball=ball(0, BRUSHED))
+        scene = build(0.4, ball=ball(0, BRUSHED))
     with pytest.raises(prt.PrtError, match="share per texel"):
         prt.precompute(scene, LIGHTING, "sparse", max_depth=2, terms=4, progress=False)
     with pytest.warns(prt.PrtWarning, match="left as diffuse: .* share per texel"):
