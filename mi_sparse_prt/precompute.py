@@ -23,19 +23,21 @@ from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_o
 from mi_sparse_prt.methods.lamps import SPP, gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
-from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
 from mi_sparse_prt.planner.choice import TARGET, WORST_FACTOR, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
-from mi_sparse_prt.reflection.reflection import Diffuse
-from mi_sparse_prt.reflection.surfaces import vertex_reflection
+from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
+from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.specular_terms import with_term_rows
 from mi_sparse_prt.transport import LightTransport
 
+FACTOR_SHARE = 0.5  # of the target error, which the factors of BRDFs may have; a quarter of its square
 DECISION = 5  # spawn key of held-out elements that decide something
 _PILOT_RAYS = 32  # cosine-distributed rays per vertex that look for surfaces that light could bounce off
 
@@ -55,7 +57,7 @@ def precompute(
     strata: int = 2,
     checkpoint_folder: str | Path | None = None,
     measurement: Measurement | None = None,
-    terms: int = 0,
+    terms: int | str = 0,
     harmonics: int | None = None,
     max_seconds: float = 300.0,
 ) -> LightTransport:
@@ -105,9 +107,14 @@ def precompute(
         an interruption goes on where it stopped (``"huang2010"``: with the dense rows only).
     measurement : Measurement, optional
         Where rows hold: the vertices of the scene's meshes if not given, or ``camera_pixels``.
-    terms : int
+    terms : int or "auto"
         K, in-out factors of each BRDF that is not diffuse ([HR10] eq. 2), for radiance that depends on the view; with
-        0, all surfaces are seen as diffuse. ``"auto"`` then means finite elements, with ever more rays for a target.
+        0, all surfaces are seen as diffuse. ``method="auto"`` then means finite elements, with ever more rays for a
+        target. ``terms="auto"`` takes for each BRDF the fewest factors, 16 at most, that reflect light of an
+        environment with half of the target error, and 0 where nothing is glossy. Mirrors, glass and masks have none:
+        a camera's ray goes on there. What factors cannot stand for (BSDFs that vary over the surface in more than their
+        diffuse part, transmit, or have lobes narrower than factors can tell) is left as diffuse, and so are all
+        surfaces where the method, the basis or the measurement knows no terms; one warning names what is left.
     harmonics : int, optional
         Spherical harmonics up to this order instead of each BRDF's own incident factors: (order + 1)^2 terms, which
         serve any BRDF (``LightTransport.with_bsdf``).
@@ -155,9 +162,8 @@ def precompute(
         problem = Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth)
         return _lit_by_lamps(problem, settings, run)
     with run.clock.phase("setup"):
-        glossy = settings.view_dependent
-        seen = vertex_reflection(scene, terms, harmonics) if glossy else _diffuse(scene, where)
-        apart = scene.specular and not glossy and where.kind == "vertices" and max_depth != 2
+        seen, settings = _reflection(scene, where, settings)
+        apart = scene.specular and where.kind == "vertices" and max_depth != 2
         problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
@@ -174,6 +180,8 @@ class _Attempts:
             with run.clock.phase("specular"):
                 options = SpecularOptions(error=(settings.target_error or TARGET) / 1.5)
                 specular = specular_light(self._problem, run.seed, options)
+                if self._problem.reflection.terms:
+                    specular = with_term_rows(self._problem, specular, run.seed)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
         self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
@@ -255,10 +263,33 @@ def _diffuse(scene: Scene, where: Measurement) -> Diffuse:
     return Diffuse(scene.albedo if where.albedo is None else where.albedo)
 
 
+def _reflection(scene: Scene, where: Measurement, settings: Settings) -> tuple[Reflection, Settings]:
+    """What points do with light, and settings that say how many terms that takes."""
+    if settings.terms == AUTO_TERMS:
+        refusal = settings.why_no_terms
+        if settings.harmonics is None and refusal is None:
+            bound = FACTOR_SHARE * (settings.target_error or TARGET)
+            chosen = chosen_reflection(scene, bound)
+            if chosen.terms:
+                return chosen, replace(settings, terms=chosen.terms)
+        elif refusal is not None:
+            _warn_if_glossy(scene, refusal)
+        settings = replace(settings, terms=0)
+    if settings.view_dependent:
+        return vertex_reflection(scene, int(settings.terms), settings.harmonics), settings
+    return _diffuse(scene, where), settings
+
+
+def _warn_if_glossy(scene: Scene, reason: str) -> None:
+    """Say why glossy surfaces are left as diffuse, though terms are asked for where they can be had."""
+    if any(material.glossy for material in scene.materials):
+        warnings.warn(f"glossy surfaces are left as diffuse: {reason}", PrtWarning, stacklevel=4)
+
+
 def _check_sampled(
     lighting: Any,
     method: str | Plan,
-    terms: int,
+    terms: int | str,
     harmonics: int | None,
     target_error: float | None,
     indirect_resolution: int | None,
@@ -268,7 +299,9 @@ def _check_sampled(
         raise PrtError(
             f"lighting is {lighting!r}: give a CubemapLighting, SceneEmitters, or what samples its elements as these do"
         )
-    if terms or any(value is not None for value in (harmonics, target_error, indirect_resolution)):
+    if terms not in (0, AUTO_TERMS) or any(
+        value is not None for value in (harmonics, target_error, indirect_resolution)
+    ):
         raise PrtError(
             "lamps: terms, harmonics, target_error and indirect_resolution are for light from a cubemap; "
             "leave them out"
@@ -279,7 +312,9 @@ def _check_sampled(
 
 def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransport:
     """The matrix whose columns are sampled emitters."""
-    method = settings.method
+    if settings.terms == AUTO_TERMS:
+        _warn_if_glossy(problem.scene, "a matrix of lamps has no terms")
+    settings, method = replace(settings, terms=0), settings.method
     if method == "gather" or (method == "auto" and problem.scene.diffuse):
         settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run)
     else:

@@ -70,10 +70,11 @@ MaxSeconds = Annotated[
     typer.Option(metavar="SECONDS", help="auto begins nothing that is predicted to take longer in all."),
 ]
 Terms = Annotated[
-    int | None,
+    str | None,
     typer.Option(
-        help="For glossy BSDFs: factors of each, 4 in [HR10]; images then depend on the view. Without, all "
-        "surfaces count as diffuse.",
+        metavar="NUMBER|auto",
+        help="For glossy BSDFs: factors of each, 4 in [HR10], or auto, as many as the target error asks for; images "
+        "then depend on the view. Without, all surfaces count as diffuse.",
         show_default=False,
     ),
 ]
@@ -121,7 +122,7 @@ def precompute(
     Example: mi-sparse-prt precompute scenes_xml/bunny.xml -o bunny.prt
 
     A forecast of time and memory comes first; a table of what was done, skipped and how good it is comes last.
-    Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain. Glossy surfaces: add --terms 4.
+    Direct light only, in seconds: add --max-depth 2. Why it was done so: add --explain. Glossy surfaces: --terms auto.
     """
     if indirect_resolution is None and method is options.Method.brute_force and target_error is None:
         indirect_resolution = min(8, resolution)
@@ -145,7 +146,7 @@ def precompute(
                 indirect_resolution=indirect_resolution,
                 strata=strata,
                 checkpoint_folder=checkpoint,
-                terms=terms or 0,
+                terms=_number_or_word(terms or "0"),
                 max_seconds=max_seconds,
             )
         # what `relight` needs to load the same scene again
@@ -158,3 +159,8 @@ def precompute(
         command.written.append(output)
         command.report = matrix_report(transport, output)
         command.show(*matrix_tables(transport, output, explain))
+
+
+def _number_or_word(text: str) -> int | str:
+    """As ``precompute`` takes it, which says what else it is to be."""
+    return int(text) if text.lstrip("-").isdigit() else text

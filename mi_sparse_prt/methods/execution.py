@@ -149,7 +149,8 @@ class Execution:
         """With interreflections among glossy surfaces."""
         with self._run.clock.phase("interreflection"):
             seed = self._run.seed
-            part, noise = glossy_indirect(self._problem, direct, plan.rays, plan.tolerance, seed)
+            specular = None if light.specular is None else light.specular.operator
+            part, noise = glossy_indirect(self._problem, direct, plan.rays, plan.tolerance, seed, specular)
         rays = light.rays | {"gather": len(self._problem.points) * plan.rays}
         account = _account(part) | {"noise_of_rays": noise}
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=account)

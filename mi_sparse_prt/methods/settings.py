@@ -11,6 +11,7 @@ from mi_sparse_prt.methods.plan import BY_NAME, TOGETHER, Plan
 METHODS = ("auto", *BY_NAME)
 BASES = ("direction", "texel")
 SPP = 16
+AUTO_TERMS = "auto"
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Settings:
     seed: int = 0
     indirect_resolution: int | None = None
     strata: int = 2
-    terms: int = 0
+    terms: int | str = 0
     harmonics: int | None = None
     measurement: str = "vertices"
     max_seconds: float = 300.0
@@ -61,10 +62,10 @@ class Settings:
         if not self.max_seconds > 0:
             raise PrtError(f"max_seconds is {self.max_seconds}; it must be positive, 300 for five minutes")
         self._check_terms()
-        if self.measurement != "vertices" and (self.view_dependent or self._needs_vertices):
+        if self.measurement != "vertices" and self._needs_vertices:
             raise PrtError(
-                f"method {self._name!r} and terms of glossy surfaces are for the vertices of meshes; at pixels leave "
-                'both out, or set method="gather" or "brute_force"'
+                f"method {self._name!r} is for the vertices of meshes; at pixels leave it out, or set "
+                'method="gather" or "brute_force"'
             )
         if CubemapLighting(self.element_resolution).resolution > self.resolution:
             raise PrtError(
@@ -73,18 +74,30 @@ class Settings:
             )
 
     def _check_terms(self) -> None:
-        if self.terms != int(self.terms) or self.terms < 0:
-            raise PrtError(f"terms must be at least 0, not {self.terms}; 4 is a good number")
-        plan = self.plan
+        if isinstance(self.terms, str):
+            if self.terms != AUTO_TERMS:
+                raise PrtError(f'terms is {self.terms!r}; it must be a whole number or "{AUTO_TERMS}"')
+        elif self.terms != int(self.terms) or self.terms < 0:
+            raise PrtError(f'terms must be at least 0, not {self.terms}; "{AUTO_TERMS}" finds a good number')
+        if self.view_dependent and self.why_no_terms is not None:
+            raise PrtError(self.why_no_terms)
+
+    @property
+    def why_no_terms(self) -> str | None:
+        """Why glossy surfaces cannot have terms by this method, in this basis or at these points; None if they can."""
+        if self.measurement != "vertices":
+            return "terms of glossy surfaces are for the vertices of meshes; at pixels leave them out"
+        plan = self.method if isinstance(self.method, Plan) else BY_NAME.get(self.method)
         if (
-            self.view_dependent
-            and plan is not None
-            and (plan.direct in TOGETHER or plan.direct == "exact" and self.basis == "texel")
+            plan is None
+            or plan.direct not in TOGETHER
+            and (plan.direct != "exact" or plan.indirect == "gather" or self.basis != "texel")
         ):
-            raise PrtError(
-                f"terms of glossy surfaces need one bit or share per texel, which method {self._name!r} does not give; "
-                'leave the method out, or set method="gather"'
-            )
+            return None
+        return (
+            f"terms of glossy surfaces need one bit or share per texel, which method {self._name!r} does not give; "
+            'leave the method out, or set method="gather"'
+        )
 
     @property
     def _needs_vertices(self) -> bool:
@@ -93,8 +106,8 @@ class Settings:
 
     @property
     def view_dependent(self) -> bool:
-        """Whether terms of glossy surfaces are asked for."""
-        return self.terms > 0 or self.harmonics is not None
+        """Whether terms of glossy surfaces are asked for, by their number."""
+        return self.terms not in (0, AUTO_TERMS) or self.harmonics is not None
 
     @property
     def _name(self) -> str:

@@ -48,6 +48,10 @@ class SparseRows(Operator):
     def nbytes(self) -> int:
         return sum(sparse_nbytes(matrix) for matrix in self.matrices)
 
+    def channel(self, number: int) -> SparseRows:
+        """One of the three channels alone, which may be that of all."""
+        return SparseRows((self.matrices[min(number, len(self.matrices) - 1)],))
+
     def rows(self, ids: Ids) -> Floats:
         return np.stack([matrix[np.asarray(ids)].toarray() for matrix in self.matrices], axis=-1)
 

@@ -13,7 +13,7 @@ from mi_sparse_prt.cache import cached_precompute
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.unit_lamps import UnitLamps
-from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.scene.scene import Scene
@@ -77,8 +77,9 @@ class SparsePRT(mi.SamplingIntegrator):
                                    ``prt.precompute``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
-    terms               integer    Of in-out factors: BSDFs that are not diffuse are then shaded for the view, per
-                                   pixel. (0: they count as diffuse)
+    terms               string or  In-out factors of each BSDF that is not diffuse, which is then shaded for the view,
+                        integer    per pixel: ``auto`` (as many as the target error asks for, 16 at most), or a number;
+                                   with 0, all count as diffuse. (auto)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
@@ -103,7 +104,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "max_seconds": props.get("max_seconds", 300.0),
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),
-            "terms": props.get("terms", 0),
+            "terms": props.get("terms", AUTO_TERMS),
         }
         Settings(self._lighting.resolution, **self._settings)  # complains now, not when rendering
         self._edge_length = props.get("edge_length", 0.0) or None
@@ -139,7 +140,7 @@ class SparsePRT(mi.SamplingIntegrator):
             raise PrtError(
                 "sparse_prt: the scene has no light; add an emitter: envmap, constant, area, point ..."
             )
-        surfaces = _read(scene, self._edge_length)
+        surfaces = _read(scene, self._edge_length, self._settings["terms"] == AUTO_TERMS)
         relit = self._relit(surfaces, scene.environment(), lamps)
         depth = self._settings["max_depth"]
         integrator = LampLitIntegrator(relit, scene, depth) if lamps else RelitIntegrator(relit[0])
@@ -173,10 +174,18 @@ class SparsePRT(mi.SamplingIntegrator):
         return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"
 
 
-def _read(scene: mi.Scene, edge_length: float | None) -> Scene:
-    """The surfaces of a scene; that matrices of a cubemap have no light of lamps is not for users of this plugin."""
+def _read(scene: mi.Scene, edge_length: float | None, shaded: bool) -> Scene:
+    """The surfaces of a scene.
+
+    That matrices of a cubemap have no light of lamps is not for users of this plugin; nor is which surfaces are not
+    diffuse, if ``shaded``: what is left as diffuse is said later.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "shape '.*' is an area emitter", PrtWarning)
+        if shaded:
+            warnings.filterwarnings(
+                "ignore", "shape '.*': BSDF .* treats its vertices as diffuse", PrtWarning
+            )
         return Scene.from_mitsuba(scene, edge_length)
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.reflection.brdf_factors import (
     BrdfFactors,
+    UnfactorableError,
     diffuse_reflectance,
+    factors_for_images,
     factors_of,
     harmonic_factors,
     is_anisotropic,
@@ -19,12 +23,17 @@ from mi_sparse_prt.reflection.brdf_factors import (
 from mi_sparse_prt.reflection.frames import beside_vertices, vertex_tangents
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
+from mi_sparse_prt.scene.materials import Material, bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 
+TOO_NARROW = 0.5  # error of images from which factors are no better than a diffuse surface
 NO_TANGENTS = (
     "shape '{}': its BSDF is anisotropic and it has no texture coordinates: Mitsuba then takes the first edge of each "
     "triangle for its tangent, which vertices cannot follow; give it texture coordinates"
 )
+
+# factors of a BSDF, and the names of its shapes; None if it counts as diffuse
+Find = Callable[[Material, list[str]], BrdfFactors | None]
 
 
 def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None) -> Reflection:
@@ -46,33 +55,129 @@ def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None
     """
     if not terms and harmonics is None:
         return Diffuse(scene.albedo)
-    material, known = np.full(scene.n_vertices, -1), dict[bytes, int]()
-    factors: list[BrdfFactors] = []
-    albedo, surface = scene.albedo.copy(), beside_vertices(scene)
-    shapes = scene.mitsuba.shapes()
-    for mesh, own in zip(scene.meshes, scene.materials, strict=True):
-        if own.diffuse:
-            continue
-        if not shapes[mesh.shape].has_vertex_texcoords() and is_anisotropic(own.bsdf, mesh.name):
-            warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=3)
-        digest = own.digest()
-        if digest not in known:
-            known[digest] = len(factors)
-            factors.append(
-                factors_of(own.bsdf, mesh.name, terms)
-                if harmonics is None
-                else harmonic_factors(own.bsdf, mesh.name, harmonics)
-            )
-        material[mesh.vertices] = known[digest]
-        found = factors[known[digest]]
-        albedo[mesh.vertices] = found.diffuse
-        if found.varying_diffuse:
-            here = dr.arange(mi.UInt32, mesh.vertices.start, mesh.vertices.stop)
-            albedo[mesh.vertices] = diffuse_reflectance(
-                own.bsdf, mesh.name, dr.gather(mi.SurfaceInteraction3f, surface, here)
-            )
-    if not factors:
+
+    def find(material: Material, names: list[str]) -> BrdfFactors:
+        if harmonics is None:
+            return factors_of(material.bsdf, names[0], terms)
+        return harmonic_factors(material.bsdf, names[0], harmonics)
+
+    found = _with_factors(scene, find, harmonics)
+    if found is None:
         raise PrtError(
             "no surface of the scene is glossy: leave terms out, its matrix is the same for all views"
         )
+    return found
+
+
+def chosen_reflection(scene: Scene, bound: float) -> Reflection:
+    """What vertices do with incident light, with as many in-out factors as images need.
+
+    Delta lobes have none: what a camera's ray sees by way of mirrors and glass, it sees by going on. Surfaces that
+    cannot be factored are left as diffuse. One warning names them, and those whose factors miss the bound.
+
+    Parameters
+    ----------
+    scene : Scene
+    bound : float
+        Relative L2 error of reflected radiance, see ``FactorError.lit``.
+
+    Returns
+    -------
+    Reflection
+        ``Diffuse`` if no surface has factors.
+    """
+    choice = _Choice(bound)
+    found = _with_factors(scene, choice.factors)
+    choice.warn()
+    return Diffuse(scene.albedo) if found is None else found
+
+
+class _Choice:
+    """Factors of glossy BSDFs, and what there is to say about them.
+
+    Parameters
+    ----------
+    bound : float
+        See ``chosen_reflection``.
+    """
+
+    def __init__(self, bound: float) -> None:
+        self._bound = bound
+        self._left: list[str] = []
+        self._off: list[str] = []
+
+    def factors(self, material: Material, names: list[str]) -> BrdfFactors | None:
+        """Of a surface that is glossy and can be factored."""
+        shapes, kind = _listed(names), bsdf_class(material.bsdf)
+        if not material.glossy and not material.bends_normals:
+            return None  # all that is not diffuse goes into single directions
+        if material.bends_normals:
+            self._left.append(f"{shapes} ({kind} bends the shading normals)")
+            return None
+        try:
+            found, error = factors_for_images(material.bsdf, names[0], self._bound)
+        except UnfactorableError as problem:
+            self._left.append(f"{shapes} ({problem.reason.removeprefix('BSDF ')})")
+            return None
+        if error > TOO_NARROW:
+            self._left.append(f"{shapes} (the lobe of {kind} is too narrow)")
+            return None
+        if error > self._bound:
+            self._off.append(f"{shapes} ({kind}, {error:.1%})")
+        return found
+
+    def warn(self) -> None:
+        """Say once what is not as it should be."""
+        said = []
+        if self._left:
+            said.append(
+                f"glossy surfaces that factors cannot stand for are left as diffuse, which the estimated error does "
+                f"not know: {', '.join(self._left)}"
+            )
+        if self._off:
+            said.append(
+                f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect, which the estimated "
+                f"error does not know: {', '.join(self._off)}"
+            )
+        if said:
+            warnings.warn("; ".join(said), PrtWarning, stacklevel=4)
+
+
+def _listed(names: list[str]) -> str:
+    """The first names of shapes, and how many there are more."""
+    most = 3
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(f"'{name}'" for name in names[:most]) + more
+
+
+def _with_factors(scene: Scene, find: Find, harmonics: int | None = None) -> InOutFactors | None:
+    """R with the factors that are found for each BSDF that is not diffuse; None if there are none."""
+    alike: dict[bytes, list[int]] = {}  # meshes of each BSDF
+    for k, own in enumerate(scene.materials):
+        if not own.diffuse:
+            alike.setdefault(own.digest(), []).append(k)
+    material, albedo, factors = np.full(scene.n_vertices, -1), scene.albedo.copy(), list[BrdfFactors]()
+    for some in alike.values():
+        found = find(scene.materials[some[0]], [scene.meshes[k].name for k in some])
+        if found is None:
+            continue
+        for k in some:
+            material[scene.meshes[k].vertices] = len(factors)
+            albedo[scene.meshes[k].vertices] = _diffuse_part(scene, k, found)
+        factors.append(found)
+    if not factors:
+        return None
     return InOutFactors(albedo, vertex_tangents(scene), scene.normals, material, tuple(factors), harmonics)
+
+
+def _diffuse_part(scene: Scene, number: int, factors: BrdfFactors) -> NDArray[np.floating]:
+    """Its reflectance, (channels,) or (vertices, 3), on one of a scene's meshes."""
+    mesh, own = scene.meshes[number], scene.materials[number]
+    textured = scene.mitsuba.shapes()[mesh.shape].has_vertex_texcoords()
+    if not textured and is_anisotropic(own.bsdf, mesh.name):
+        warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=6)
+    if not factors.varying_diffuse:
+        return factors.diffuse
+    here = dr.arange(mi.UInt32, mesh.vertices.start, mesh.vertices.stop)
+    beside = dr.gather(mi.SurfaceInteraction3f, beside_vertices(scene), here)
+    return diffuse_reflectance(own.bsdf, mesh.name, beside)

@@ -51,6 +51,10 @@ class Material:
     bsdf : mi.BSDF
     diffuse : bool
         It reflects diffusely and does nothing else.
+    glossy : bool
+        It scatters some light into a range of directions, and not alike into all.
+    bends_normals : bool
+        A bump or normal map turns its shading normals.
     two_sided : bool
         It reflects light on its back, too, by more than a mirror's single direction.
     passes_light : bool
@@ -71,8 +75,8 @@ class Material:
         if not self.diffuse:
             what = "bends the shading normals" if self._lambertian else "is not diffuse"
             notes.append(
-                f"shape '{name}': BSDF {bsdf_class(self.bsdf)} {what}; matrices treat its vertices as diffuse "
-                "with the same reflectance (those of precompute_glossy do not), indirect paths use the real BSDF"
+                f"shape '{name}': BSDF {bsdf_class(self.bsdf)} {what}; a matrix treats its vertices as diffuse "
+                'with the same reflectance unless it is given terms="auto", indirect paths use the real BSDF'
             )
         if self._emitter is not None:
             notes.append(
@@ -92,7 +96,9 @@ class Material:
         self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
         flags = int(bsdf.flags())
         self._lambertian = flags & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.DiffuseReflection)
-        self.diffuse = self._lambertian and not self._classes & BUMPED
+        self.bends_normals = bool(self._classes & BUMPED)
+        self.diffuse = self._lambertian and not self.bends_normals
+        self.glossy = bool(flags & int(mi.BSDFFlags.Glossy))
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))

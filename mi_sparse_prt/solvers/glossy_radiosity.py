@@ -24,6 +24,8 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import random_combinations
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.sparse_rows import SparseRows
+from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
@@ -32,6 +34,7 @@ from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, cosine_
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements, Gathered
+from mi_sparse_prt.solvers.specular import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import contacts
 
@@ -79,11 +82,11 @@ class GlossyGather(FiniteElements):
             problem.max_depth,
             seed,
         )
+        self._visibility = direct.visibility
 
     def _count_for(self, direct: Operator) -> int:
         """By the direct light of white surfaces: that of terms is dear, and joins with the first bounce."""
-        assert isinstance(direct, FactoredVisibility)
-        unit_albedo = direct.visibility.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0]
+        unit_albedo = self._visibility.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0]
         return self.bounces(
             np.concatenate([unit_albedo, np.zeros(direct.shape[0] - len(unit_albedo), np.float32)])
         )
@@ -223,7 +226,12 @@ def _fill(
 
 
 def glossy_indirect(
-    problem: Problem, direct: FactoredVisibility, rays_per_vertex: int, tolerance: float, seed: int
+    problem: Problem,
+    direct: FactoredVisibility,
+    rays_per_vertex: int,
+    tolerance: float,
+    seed: int,
+    specular: SparseRows | None = None,
 ) -> tuple[Gathered, float]:
     """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
@@ -237,16 +245,22 @@ def glossy_indirect(
     tolerance : float
         As for ``RadiositySolver.indirect``; no less than the noise of the rays, whose rank is full.
     seed : int
+    specular : SparseRows, optional
+        Light from the sky by way of mirrors and glass, which surfaces send on as well. What they send on by way of
+        mirrors and glass reaches unit-albedo rows, and of glossy surfaces as far as these are diffuse.
     """
-    albedo, outgoing = _channels(problem.reflection)
+    albedo, outgoing = _channels(problem.reflection, 1 if specular is None else specular.shape[2])
     ones = np.ones(direct.shape[0] - len(albedo), np.float32)
     rays = gather_rays(problem, outgoing, rays_per_vertex, seed)
     noise = rays.noise(direct, albedo.mean(axis=1), problem.points, seed)
+    after_mirrors = _after_mirrors(problem, direct.shape[0], rays_per_vertex, seed)
     found = []
     for channel, shade in enumerate(albedo.T):
         matrix = gather_matrix(direct, rays, channel)
+        matrix = matrix if after_mirrors is None else scipy.sparse.csr_array(matrix + after_mirrors)
         solver = GlossyGather(matrix, np.concatenate([shade, ones]), problem, direct, seed)
-        found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE))))
+        sent: Operator = direct if specular is None else Sum((direct, specular.channel(channel)))
+        found.append(solver.indirect(sent, max(tolerance, min(noise, MOST_NOISE))))
     return Gathered(
         tuple(f.left[0] for f in found),
         tuple(f.right[0] for f in found),
@@ -255,10 +269,19 @@ def glossy_indirect(
     ), noise
 
 
-def _channels(reflection: Reflection) -> tuple[Floats, Floats]:
-    """Albedos (n_v, channels) and g_k (channels, ...), one channel where all are alike."""
+def _after_mirrors(problem: Problem, rows: int, rays: int, seed: int) -> scipy.sparse.csr_array | None:
+    """What G (rows, rows) lacks without specular surfaces, for unit-albedo rows; None where there are none."""
+    if not problem.specular_apart:
+        return None
+    matrix = specular_form_factors(problem, np.arange(len(problem.points)), rays, seed)
+    matrix.resize((rows, rows))
+    return matrix
+
+
+def _channels(reflection: Reflection, least: int) -> tuple[Floats, Floats]:
+    """Albedos (n_v, channels) and g_k (channels, ...); one channel where all are alike and ``least`` is no more."""
     assert isinstance(reflection, InOutFactors)
     albedo, outgoing = reflection.albedo, outgoing_tables(reflection.factors)
     grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
-    count = 1 if grey else 3
+    count = least if grey else 3
     return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

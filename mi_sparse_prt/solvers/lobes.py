@@ -23,11 +23,16 @@ class Lobes:
     reflection : InOutFactors
     outgoing : (channels, materials, size, size, K) float32, optional
         g_k, where they are asked for.
+
+    Attributes
+    ----------
+    terms : int
+        K.
     """
 
     def __init__(self, reflection: InOutFactors, outgoing: Floats | None = None) -> None:
         n, tables, glossy = len(reflection.albedo), incident_tables(reflection.factors), reflection.glossy
-        self._size, self._terms = tables.shape[1], reflection.terms
+        self._size, self.terms = tables.shape[1], reflection.terms
         material = np.full(n, len(tables), np.uint32)  # one more, which is dark
         material[glossy] = reflection.material[glossy]
         turn = np.zeros((n, 3, 3), np.float32)
@@ -59,7 +64,7 @@ class Lobes:
         self, table: mi.Float, vertex: mi.UInt32, local: mi.Vector3f, valid: mi.Mask
     ) -> list[mi.Float]:
         material = dr.gather(mi.UInt32, self._material, vertex, valid)
-        return look_up(table, self._size, self._terms, material, local, valid)
+        return look_up(table, self._size, self.terms, material, local, valid)
 
 
 def _with_dark(tables: Floats) -> mi.Float:

@@ -236,6 +236,29 @@ def test_held_out_pairs_stand_for_all(kind):
     assert found.sum() == pytest.approx(known.sum(), rel=0.02)
 
 
+def test_errors_in_light_are_those_of_random_skies():
+    """
+    Rationale: what an image errs by, under light of which neighbouring directions are alike.
+    Expected: the relative L2 of radiance over 200 random skies, summed on a grid, within 5%.
+    """
+    bsdf, grid = phong(10), DirectionGrid(24, 48)
+    factors = factor_brdf(bsdf, "ball", 6, grid)
+    error = measure_factor_error(factors, bsdf, "ball")
+    order, rng = 24, np.random.default_rng(2)
+    degree = np.repeat(np.arange(order + 1), 2 * np.arange(order + 1) + 1)
+    skies = (rng.standard_normal((200, len(degree))) / (degree + 1)) @ grid.harmonics(order)
+    views = even_pairs(64)[1]
+    wi, wo = np.tile(grid.directions, (len(views), 1)), np.repeat(views, len(grid.directions), axis=0)
+    true = evaluate_brdf(bsdf, "ball", wi, wo)[:, 0].astype(np.float64)
+    for terms in (1, 4, 6):
+        missing = factors.first(terms).values(wi, wo)[:, 0] - true
+        radiance, off = (
+            x.reshape(len(views), -1) @ (grid.solid_angles[:, None] * skies.T) for x in (true, missing)
+        )
+        assert error.lit[terms - 1] == pytest.approx(np.linalg.norm(off) / np.linalg.norm(radiance), rel=0.05)
+    assert (error.lit < error.whole).all()
+
+
 def test_same_seed_same_factors():
     a, b = (factor_brdf(phong(10), "ball", 4, SMALL, seed=3) for _ in range(2))
     assert np.array_equal(a.incident, b.incident) and np.array_equal(a.outgoing, b.outgoing)

@@ -5,12 +5,17 @@ what is left, on a grid of directions; values between grid points are bilinear.
 """
 
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import (
+    UnfactorableError,
     diffuse_reflectance,
     evaluate_brdf,
     is_anisotropic,
 )
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
-from mi_sparse_prt.reflection.brdf_factors.factor_cache import FactorOptions, factors_of
+from mi_sparse_prt.reflection.brdf_factors.factor_cache import (
+    FactorOptions,
+    factors_for_images,
+    factors_of,
+)
 from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, measure_factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.reflection.brdf_factors.harmonics import harmonic_factors
@@ -21,11 +26,13 @@ __all__ = [
     "DirectionGrid",
     "FactorError",
     "FactorOptions",
+    "UnfactorableError",
     "is_anisotropic",
     "diffuse_reflectance",
     "evaluate_brdf",
     "factor_brdf",
     "measure_factor_error",
+    "factors_for_images",
     "factors_of",
     "harmonic_factors",
 ]

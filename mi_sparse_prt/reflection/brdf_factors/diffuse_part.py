@@ -19,6 +19,20 @@ SLANTED = (0.6, 0.0, 0.8)  # light that goes back where it came from: no highlig
 ROUNDING = 1e-5  # relative
 
 
+class UnfactorableError(PrtError):
+    """A BSDF that in-out factors cannot stand for.
+
+    Attributes
+    ----------
+    reason : str
+        What it does that they cannot, without the name of its shape.
+    """
+
+    def __init__(self, name: str, reason: str, advice: str) -> None:
+        super().__init__(f"shape '{name}': {reason}{advice}")
+        self.reason = reason
+
+
 class GlossyPart:
     """The front of a reflective BSDF without its diffuse part, in the local frame of the surface, +Z its normal.
 
@@ -148,9 +162,10 @@ def _evaluate(
     dr.eval(value, wrong)
     if dr.any(wrong):
         first = int(np.flatnonzero(wrong.numpy())[0])
-        raise PrtError(
-            f"shape '{name}': its BSDF is {np.array(value)[:, first].tolist()} for light from "
-            f"{np.array(light)[:, first].tolist()}; correct the BSDF's parameters or use path tracing instead"
+        raise UnfactorableError(
+            name,
+            f"its BSDF is {np.array(value)[:, first].tolist()} for light from {np.array(light)[:, first].tolist()}",
+            "; correct the BSDF's parameters or use path tracing instead",
         )
     return value
 
@@ -171,9 +186,10 @@ def _check(bsdf: mi.BSDF, name: str) -> bool:
         if varies and not lambertian:
             problem = "varies over the surface in more than a Lambertian reflectance"
     if problem:
-        raise PrtError(
-            f"shape '{name}': BSDF {bsdf_class(bsdf)} {problem}, which factors of a BRDF cannot; "
-            "use path tracing instead"
+        raise UnfactorableError(
+            name,
+            f"BSDF {bsdf_class(bsdf)} {problem}",
+            ", which factors of a BRDF cannot; use path tracing instead",
         )
     return varies
 

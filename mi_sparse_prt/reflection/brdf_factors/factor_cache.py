@@ -22,7 +22,9 @@ from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, meas
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.scene.materials import Material
 
-FORMAT = 1  # of the files; another one whenever factors of the same BSDF would be others
+FORMAT = 2  # of the files; another one whenever factors of the same BSDF would be others
+
+ERRORS = ("whole", "grazing", "peak", "lit")
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,37 @@ def factors_of(
     return factors.first(enough or MOST_TERMS)
 
 
+def factors_for_images(
+    bsdf: mi.BSDF, name: str, bound: float, folder: Path | None = None, options: FactorOptions | None = None
+) -> tuple[BrdfFactors, float]:
+    """The fewest factors that meet an error of images, or all 16; none without its partner.
+
+    Parameters
+    ----------
+    bsdf, name, folder, options
+        As for ``factors_of``.
+    bound : float
+        Relative L2 error of the radiance that the surface reflects, ``FactorError.lit``.
+
+    Returns
+    -------
+    factors : BrdfFactors
+    error : float
+        The error that they have; it may be above the bound.
+
+    Raises
+    ------
+    PrtError
+        As ``factor_brdf``.
+    """
+    factors, error = _find_or_make(bsdf, name, folder or cache_folder() / "brdf", options or FactorOptions())
+    good = np.flatnonzero(error.lit <= bound)
+    enough = int(good[0]) + 1 if len(good) else MOST_TERMS
+    whole = (factors.complete(terms) for terms in range(enough, MOST_TERMS))
+    found = next((some for some in whole if some.terms >= enough), factors.complete(MOST_TERMS))
+    return found, float(error.lit[found.terms - 1])
+
+
 def _find_or_make(
     bsdf: mi.BSDF, name: str, folder: Path, options: FactorOptions
 ) -> tuple[BrdfFactors, FactorError]:
@@ -128,7 +161,7 @@ def _read(path: Path, grid: DirectionGrid) -> tuple[BrdfFactors, FactorError] | 
         factors = BrdfFactors(
             grid, kept["diffuse"], kept["incident"], kept["outgoing"], bool(kept["varying_diffuse"])
         )
-        return factors, FactorError(kept["whole"], kept["grazing"], kept["peak"])
+        return factors, FactorError(*(kept[name] for name in ERRORS))
     except Exception:  # damage raises whatever the damaged bytes lead to; what is not found is made again
         return None
 
@@ -140,10 +173,7 @@ def _write(path: Path, factors: BrdfFactors, error: FactorError) -> None:
         "incident": factors.incident,
         "outgoing": factors.outgoing,
         "varying_diffuse": np.array(factors.varying_diffuse),
-        "whole": error.whole,
-        "grazing": error.grazing,
-        "peak": error.peak,
-    }
+    } | {name: getattr(error, name) for name in ERRORS}
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:  # a path would be given another suffix

@@ -11,7 +11,7 @@ import numpy as np
 from mi_sparse_prt.core.metrics import relative_l2_from_squares
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import Doubles, Floats
-from mi_sparse_prt.reflection.brdf_factors.factorization import BrdfFactors
+from mi_sparse_prt.reflection.brdf_factors.factorization import LIGHT_FALL, BrdfFactors
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,15 @@ class FactorError:
     whole, grazing, peak : (K,) float64
         Over all pairs of directions; those of which one is more than 75 degrees off the normal; and those with more
         than half of the largest value that was found for a similar height of the outgoing direction.
+    lit : (K,) float64
+        Of radiance over all outgoing directions, under random light as smooth as that of environments: what an image
+        shows. Smaller than the others, which ask for every direction of the light by itself.
     """
 
     whole: Doubles
     grazing: Doubles
     peak: Doubles
+    lit: Doubles
 
     def terms_for(self, target: float) -> int | None:
         """The fewest terms with no larger error over all pairs; None if there are none."""
@@ -71,13 +75,56 @@ def measure_factor_error(
         squares = weights * ((found - true) ** 2).sum(axis=1)
         sums = [(squares[some].sum(), norms[some].sum()) for some in (slice(None), grazing, peak)]
         errors.append([float(relative_l2_from_squares(*pair)) for pair in sums])
-    return FactorError(*np.transpose(errors))
+    whole, at_grazing, at_peak = np.transpose(errors)
+    return FactorError(whole, at_grazing, at_peak, _errors_in_light(factors, bsdf, name, seed, pairs))
+
+
+def _errors_in_light(factors: BrdfFactors, bsdf: mi.BSDF, name: str, seed: int, pairs: int) -> Doubles:
+    """Errors (K,) of radiance under random light, see ``FactorError.lit``.
+
+    For each of some outgoing directions, two independent sets of incident ones integrate an error. The mean product of
+    the two integrals is the squared error, without the noise of either; so it is with the radiance itself.
+    """
+    half = 128  # incident directions in a set
+    rng = np.random.default_rng([seed, 1])
+    views = max(1, pairs // (2 * half))
+    wo = np.repeat(_cosine_directions(rng.random((views, 2))), 2 * half, axis=0)
+    wi, weights = _incident_directions(bsdf, wo, rng)
+    diffuse = factors.diffuse_values(wi, wo)
+    true = GlossyPart(bsdf, name).values(wi, wo) + diffuse
+    f, g = factors.grid.interpolate(factors.incident, wi), factors.grid.interpolate(factors.outgoing, wo)
+    found = diffuse + np.cumsum(f[:, :, None] * np.swapaxes(g, 1, 2), axis=0)  # [term, pair, channel]
+    values = np.concatenate([true[None], found - true]) * weights[:, None]
+    a, b = np.moveaxis(values.reshape(len(values), views, 2, half, -1), 2, 0)
+    angles = np.swapaxes(wi.astype(np.float64).reshape(views, 2, half, 3), 0, 1)
+    light = _light_at_angle(angles[0] @ np.swapaxes(angles[1], 1, 2))  # [view, first, second]
+    squares = np.maximum(np.einsum("kvac,vab,kvbc->k", a, light, b, optimize=True), 0)
+    return np.array([relative_l2_from_squares(square, squares[0]) for square in squares[1:]])
+
+
+def _light_at_angle(cosine: Doubles) -> Doubles:
+    """The mean product of light from two directions, by the cosine between them; power per degree as in environments
+    (see ``factorization``), as far as texels can tell.
+    """
+    degrees = 48
+    power = (np.arange(degrees) + 1.0) ** -LIGHT_FALL
+    weights = power * (2 * np.arange(degrees) + 1)
+    x = np.linspace(-1, 1, 4096)
+    table = np.polynomial.legendre.legval(x, weights)
+    return np.asarray(np.interp(cosine, x, table))
 
 
 def sample_pairs(bsdf: mi.BSDF, pairs: int, seed: int) -> tuple[Floats, Floats, Doubles]:
     """Pairs of directions, and weights that make sums of them integrals over dw_i cos_o dw_o."""
     rng = np.random.default_rng(seed)
     wo = _cosine_directions(rng.random((pairs, 2)))  # its density is cos_o / pi
+    wi, weights = _incident_directions(bsdf, wo, rng)
+    return wi, wo, weights * (np.pi / pairs)
+
+
+def _incident_directions(bsdf: mi.BSDF, wo: Floats, rng: np.random.Generator) -> tuple[Floats, Doubles]:
+    """An incident direction for each outgoing one, and one over its density: half even, half by the BSDF itself."""
+    pairs = len(wo)
     si = dr.zeros(mi.SurfaceInteraction3f, pairs)
     si.wi = mi.Vector3f(np.ascontiguousarray(wo.T))
     u = rng.random((3, pairs), np.float32)
@@ -91,8 +138,7 @@ def sample_pairs(bsdf: mi.BSDF, pairs: int, seed: int) -> tuple[Floats, Floats, 
     wi[~(wi[:, 2] > 0)] = (0, 0, 1)  # samples that fail: their weight is 0
     density = np.array(bsdf.pdf(context, si, mi.Vector3f(np.ascontiguousarray(wi.T))), np.float64)
     failed = ~even & ~(np.array(sample.pdf) > 0)
-    weights = np.where(failed, 0.0, np.pi / (0.5 / (2 * np.pi) + 0.5 * density) / pairs)
-    return wi, wo, weights
+    return wi, np.where(failed, 0.0, 1 / (0.5 / (2 * np.pi) + 0.5 * density))
 
 
 def _cosine_directions(u: Doubles) -> Floats:

@@ -30,6 +30,7 @@ from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, Doubles, Floats
 
 MOST_TERMS = 16
+LIGHT_FALL = 2.0  # power of light per harmonic of degree l is (l + 1)^-LIGHT_FALL, see above
 
 
 @dataclass(frozen=True)
@@ -189,10 +190,10 @@ def _light(grid: DirectionGrid) -> tuple[Floats, float]:
     """The mean product of light from two incident directions, times roots of their solid angles: (r, grid) whose
     product with itself, transposed, and with this much of the identity added, is that matrix.
     """
-    order, fall = 16, 2.0  # power (l + 1)^-fall per harmonic of degree l, see above
+    order = 16
     degree = np.repeat(np.arange(order + 1), 2 * np.arange(order + 1) + 1)
-    rest = (order + 2.0) ** -fall  # of all higher degrees
-    amplitude = np.sqrt((degree + 1.0) ** -fall - rest)
+    rest = (order + 2.0) ** -LIGHT_FALL  # of all higher degrees
+    amplitude = np.sqrt((degree + 1.0) ** -LIGHT_FALL - rest)
     smooth = amplitude[:, None] * grid.harmonics(order) * np.sqrt(grid.solid_angles)
     return smooth.astype(np.float32), rest
 

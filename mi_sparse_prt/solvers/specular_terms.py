@@ -1,0 +1,136 @@
+"""Light by way of mirrors, glass and masks, as the in-out factors of glossy points receive it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.operators.sparse_rows import SparseRows
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.lobes import Lobes
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import (
+    LANES,
+    PARTS,
+    SPECULAR,
+    SpecularLight,
+    SpecularRays,
+    passed_light,
+)
+
+STRATA = 4  # per axis of a part of a hemisphere, each with a ray
+
+Floats = NDArray[np.float32]
+Sparse: TypeAlias = scipy.sparse.csr_array
+
+
+class _Light(NamedTuple):
+    """Light of texels at points: which ones (n,), its directions' weights in terms (n, K), and channels (n, 3)."""
+
+    rows: NDArray[np.int64]
+    texels: NDArray[np.int64]
+    into: Floats
+    light: Floats
+
+
+def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> SpecularLight:
+    """Specular light with rows for the terms of glossy vertices, after those of all vertices.
+
+    Light by way of mirrors and glass is weighted by incident factors in the direction of each ray, and is noisier than
+    that of unit-albedo rows; light that comes straight through, in the direction of its texel's centre.
+
+    Parameters
+    ----------
+    problem : Problem
+        With in-out factors, at the vertices of its scene.
+    specular : SpecularLight
+        Of unit-albedo rows.
+    seed : int
+    """
+    reflection = problem.reflection
+    assert isinstance(reflection, InOutFactors)
+    ids, lobes = reflection.glossy, Lobes(reflection)
+    bent_seed, straight_seed = element_seeds(random_stream(seed, SPECULAR, 1), 2)
+    walks = _TermWalks(problem)
+    shape = len(ids) * reflection.terms, problem.emission.size
+    sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
+    parts = [walks.bent(ids, lobes, bent_seed)]
+    if problem.scene.passes_straight:
+        parts.append(_straight(problem, ids, lobes, straight_seed))
+    for part in parts:
+        for found in part:
+            sums = [a + b for a, b in zip(sums, _rows_of_terms(found, shape), strict=True)]
+    known = specular.operator.matrices
+    matrices = tuple(
+        scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
+        for c, terms in enumerate(sums)
+    )
+    return SpecularLight(SparseRows(matrices), specular.noise, specular.rays + walks.traced)
+
+
+class _TermWalks(SpecularRays):
+    """Rays that remember in which direction they left their points."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem)
+        self.traced = 0
+
+    def bent(self, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
+        """Light that points receive by way of mirrors and glass, for some rays at a time."""
+        rows, parts = self.parts_that_see(ids, seed)
+        self.traced += len(ids) * PARTS**2 + len(rows) * STRATA**2
+        step = max(1, LANES // (STRATA**2 * 8))
+        for a in range(0, len(rows), step):
+            some = slice(a, a + step)
+            ray, row, rng = self._rays(ids, rows[some], parts[some], STRATA, seed)
+            point = dr.gather(mi.UInt32, mi.UInt32(np.asarray(ids).astype(np.uint32)), row)
+            into, of_lane = _weights(lobes, point, ray.d), row.numpy().astype(np.int64)
+            for lanes, texels, light, hits in self._walked(ray, dr.arange(mi.UInt32, len(of_lane)), rng):
+                ends, sky = lanes[~hits], light[~hits] / np.float32((PARTS * STRATA) ** 2)
+                yield _Light(of_lane[ends], texels[~hits], into[ends], sky)
+
+
+def _straight(problem: Problem, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
+    """Light that comes straight through surfaces which let a part of it pass."""
+    direct = DirectSolver(problem, seed=seed)
+    step = max(1, LANES // (direct.lighting.size * direct.rays_per_element))
+    for a in range(0, len(ids), step):
+        found = passed_light(direct, ids[a : a + step]).tocoo()
+        rows, texels = found.coords[0] + a, found.coords[1]
+        point = mi.UInt32(np.asarray(ids)[rows].astype(np.uint32))
+        towards = mi.Vector3f(np.ascontiguousarray(direct.lighting.directions[texels].T))
+        light = np.repeat(found.data[:, None], 3, axis=1)
+        yield _Light(rows.astype(np.int64), texels.astype(np.int64), _weights(lobes, point, towards), light)
+
+
+def _weights(lobes: Lobes, point: mi.UInt32, direction: mi.Vector3f) -> Floats:
+    """Terms (n, K) of unit-albedo light from directions (world)."""
+    if dr.width(point) == 0:
+        return np.zeros((0, lobes.terms), np.float32)
+    return np.stack([weight.numpy() for weight in lobes.incident(point, direction)], axis=1)
+
+
+def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
+    """Light as a matrix (points * K, texels) of each channel."""
+    count, terms = found.into.shape
+    columns = (found.rows[:, None] * terms + np.arange(terms)).ravel()
+    starts = np.arange(0, count * terms + 1, terms)
+    into = scipy.sparse.csr_array((found.into.ravel(), columns, starts), shape=(count, shape[0]))
+    into = scipy.sparse.csr_array(into.T)  # [term of a point, end]
+    grey = bool((found.light == found.light[:, :1]).all())
+    matrices = []
+    for light in found.light.T[: 1 if grey else 3]:
+        ends = scipy.sparse.csr_array(
+            (np.ascontiguousarray(light), found.texels, np.arange(count + 1)), shape=(count, shape[1])
+        )
+        matrices.append(scipy.sparse.csr_array(into @ ends).astype(np.float32))
+    return matrices * 3 if grey else matrices
