@@ -20,11 +20,20 @@ def read_mesh(shape: mi.Mesh, name: str) -> TriangleMesh:
 
     n, t = shape.vertex_count(), shape.face_count()
     vertex_attributes, face_attributes = {}, {}
-    for key in mi.traverse(shape).keys():
-        if key.startswith("vertex_") and key[7:] not in ("positions", "normals", "texcoords"):
-            vertex_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(n, -1)
-        elif key.startswith("face_"):
-            face_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(t, -1)
+    parameters = mi.traverse(shape)
+    # an `ellipsoidsmesh` has values for each ellipsoid, all of as many vertices and triangles, instead of attributes
+    ellipsoids = len(parameters["data"]) // 10 if shape.class_name() == "EllipsoidsMesh" else None
+    for key in parameters.keys():
+        found = vertex_attributes if key.startswith("vertex_") else face_attributes
+        of_ours = key.startswith("face_") or key.startswith("vertex_")
+        if not of_ours or key in ("vertex_positions", "vertex_normals", "vertex_texcoords"):
+            continue
+        count = n if found is vertex_attributes else t
+        if ellipsoids is None:
+            found[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(count, -1)
+        else:
+            values = np.array(parameters[key], np.float32).reshape(ellipsoids, -1)
+            found[key] = np.repeat(values, count // ellipsoids, axis=0)
     return TriangleMesh(
         name,
         rows(shape.vertex_positions_buffer(), 3, np.float32),

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.curves import curve_mesh
+from mi_sparse_prt.scene.ellipsoids import ellipsoids_mesh
 from mi_sparse_prt.scene.instances import PlacedShape, merge_groups, moved, placed_shapes
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mesh_cleaning import (
@@ -110,8 +112,12 @@ def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> fl
 
 
 def _tessellate(where: PlacedShape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
-    """The grid of a sphere, disk or cylinder, in world space or that of its group; every other shape is refused."""
+    """Triangles of a shape that has none, in world space or that of its group; an unknown one is refused."""
     shape, edge_length = where.shape, edge_length / where.largest_scale
+    if shape.class_name() in ("BSplineCurve", "LinearCurve"):
+        return curve_mesh(shape, edge_length, where.name, limit)
+    if shape.class_name() == "Ellipsoids":
+        return ellipsoids_mesh(shape, edge_length, where.name, limit)
     kind = {"Sphere": "sphere", "Disk": "disk", "Cylinder": "cylinder"}.get(shape.class_name())
     if kind is None:
         raise PrtError(
