@@ -42,8 +42,8 @@ class Rings:
 def curve_mesh(shape: mi.Shape, edge_length: float, name: str, limit: int) -> TriangleMesh:
     """A Mitsuba `bsplinecurve` or `linearcurve` as tubes, in the frame of its control points.
 
-    Ends and joints of linear curves are round, ends of splines are open, as Mitsuba has them. Tubes are as wide on
-    average, seen from the side, as the round ones.
+    Ends and joints of linear curves are round, as Mitsuba has them; its splines are open, and seen through from inside,
+    which triangles are not: they get flat ends. Tubes are as wide on average, seen from the side, as the round ones.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def curve_mesh(shape: mi.Shape, edge_length: float, name: str, limit: int) -> Tr
 
 
 def _spline(points: Rows, edge_length: float) -> Rings:
-    """Rings of a uniform cubic B-spline of control points (n, xyz and radius)."""
+    """Rings of a uniform cubic B-spline of control points (n, xyz and radius), flat at both ends."""
     corners = np.stack(
         [points[k : len(points) - 3 + k] for k in range(4)]
     )  # [corner, segment, xyz and radius]
@@ -94,7 +94,11 @@ def _spline(points: Rows, edge_length: float) -> Rings:
     )
     speed = np.linalg.norm(by[:, :3], axis=1)
     leans = -by[:, 3] / np.hypot(by[:, 3], np.where(speed > 0, speed, 1))
-    return Rings(at[:, :3], normalise_rows(by[:, :3]), at[:, 3], leans, segment + u)
+    axes, along = normalise_rows(by[:, :3]), segment + u
+    closed = np.concatenate([[0, 0], np.arange(len(u)), [len(u) - 1, len(u) - 1]])
+    radii, leans = at[closed, 3], leans[closed]
+    radii[[0, -1]], leans[:2], leans[-2:] = 0, -1, 1
+    return Rings(at[closed, :3], axes[closed], radii, leans, along[closed])
 
 
 def _polyline(points: Rows, edge_length: float) -> Rings:
@@ -102,7 +106,7 @@ def _polyline(points: Rows, edge_length: float) -> Rings:
     parts: list[tuple[Rows, Rows, Rows, Rows, Rows]] = []
     step = points[1:] - points[:-1]
     length = np.linalg.norm(step[:, :3], axis=1)
-    kept = np.flatnonzero(length > 0)
+    kept: list[int] = np.flatnonzero(length > 0).tolist()
     axes = normalise_rows(step[:, :3])
     leans = -np.clip(step[:, 3] / np.where(length > 0, length, 1), -1, 1)  # where cones touch their balls
 

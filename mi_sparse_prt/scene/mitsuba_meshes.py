@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 
+_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
 def read_mesh(shape: mi.Mesh, name: str) -> TriangleMesh:
     """The buffers of a Mitsuba mesh as NumPy copies."""
 
@@ -19,16 +22,15 @@ def read_mesh(shape: mi.Mesh, name: str) -> TriangleMesh:
         return np.array(buffer, dtype=dtype).reshape(-1, width).copy()
 
     n, t = shape.vertex_count(), shape.face_count()
-    vertex_attributes, face_attributes = {}, {}
+    vertex_attributes: dict[str, NDArray[np.float32]] = {}
+    face_attributes: dict[str, NDArray[np.float32]] = {}
     parameters = mi.traverse(shape)
     # an `ellipsoidsmesh` has values for each ellipsoid, all of as many vertices and triangles, instead of attributes
     ellipsoids = len(parameters["data"]) // 10 if shape.class_name() == "EllipsoidsMesh" else None
     for key in parameters.keys():
-        found = vertex_attributes if key.startswith("vertex_") else face_attributes
-        of_ours = key.startswith("face_") or key.startswith("vertex_")
-        if not of_ours or key in ("vertex_positions", "vertex_normals", "vertex_texcoords"):
+        if not key.startswith(("vertex_", "face_")) or key in _GEOMETRY:
             continue
-        count = n if found is vertex_attributes else t
+        found, count = (vertex_attributes, n) if key.startswith("vertex_") else (face_attributes, t)
         if ellipsoids is None:
             found[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(count, -1)
         else:
