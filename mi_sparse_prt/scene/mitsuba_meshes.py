@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
-
+#: Parameters of meshes that are no attributes.
 _GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 
 

@@ -202,15 +202,13 @@ CURVES = """0 0 0 .1
 
 @pytest.mark.parametrize(("kind", "missed"), [("linearcurve", 0.01), ("bsplinecurve", 0.12)])
 def test_curves_are_tubes(kind: str, missed: float, tmp_path: Path) -> None:
-    """A bend of 63 degrees, and radii that grow. Splines of Mitsuba are open; rays that enter go on through the wall."""
+    """Bends, and radii that grow. Splines of Mitsuba are open: rays that enter go on through the wall."""
     (tmp_path / "curves.txt").write_text(CURVES)
     curve = {"type": kind, "filename": str(tmp_path / "curves.txt")}
     original = mi.load_dict({"type": "scene", "curve": curve})
     scene = Scene.from_mitsuba(original, 0.03)
     assert scene.warnings == []
     check_hits(original, scene, missed=missed, off=0.01)
-    moved = {
-        "group": {"type": "shapegroup", "curve": curve},
-        "instance": instance("group", T().scale([1, 2, 1])),
-    }
+    group = {"group": {"type": "shapegroup", "curve": curve}}
+    stretched = mi.load_dict({"type": "scene", **group, "one": instance("group", T().scale([1, 2, 1]))})
     check_hits(stretched, Scene.from_mitsuba(stretched, 0.03), missed=missed, off=0.02)
