@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
+from itertools import product
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -215,12 +216,27 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
     n, texels = lighting.resolution, np.arange(lighting.n_directions)
     if (s := _samples_per_edge(emitter, n)) is not None:
         return _sampled(emitter, texels, n, s)[0].astype(np.float32)
-    # a formula may have a sun of half a degree in it: two samples meet it, and its texels get more of them
-    coarse = max(16, -(-384 // n))
-    radiance, peaks = _sampled(emitter, texels, n, coarse)
-    sharp = np.flatnonzero(peaks > 2 * radiance.max(axis=1))
-    radiance[sharp] = _sampled(emitter, sharp, n, 16 * coarse)[0]
-    return radiance.astype(np.float32)
+    return _project_formula(emitter, lighting).astype(np.float32)
+
+
+def _project_formula(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[np.float64]:
+    """Mean radiance of texels of an emitter that may have a sun of half a degree in it.
+
+    At least two samples per degree and axis meet such a sun. Where one does, texels of at most 1.4 degrees get more,
+    also those beside it, of which the sun may cover too little for a sample.
+    """
+    n, m = lighting.resolution, max(lighting.resolution, 64)
+    small = CubemapLighting(m)
+    samples = -(-max(16 * n, 384) // m)
+    radiance, peaks = _sampled(emitter, np.arange(small.n_directions), m, samples)
+    sharp = peaks > 2 * radiance.max(axis=1)
+    found = np.flatnonzero(sharp)
+    for dx, dy in product((-1, 0, 1), repeat=2):
+        beside = small.beside(dx, dy)[found]
+        sharp[beside[beside >= 0]] = True
+    radiance[sharp] = _sampled(emitter, np.flatnonzero(sharp), m, max(samples, 12288 // m))[0]
+    power = (radiance * small.solid_angles[:, None]).reshape(6, n, m // n, n, m // n, 3).sum(axis=(2, 4))
+    return power.reshape(-1, 3) / lighting.solid_angles[:, None]
 
 
 def _sampled(

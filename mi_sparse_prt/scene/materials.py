@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.traversal import children
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 #: BSDFs and textures that do not vary over the surface nor with its rotation.
@@ -110,9 +111,7 @@ class Material:
         """What the back of the shape is made of."""
         behind = copy(self)
         if self._text.startswith("TwoSided["):
-            nested = _Nested()
-            self.bsdf.traverse(nested)
-            behind._set_bsdf(nested.objects["brdf_1"], 1)
+            behind._set_bsdf(dict(children(self.bsdf))["brdf_1"], 1)
         else:
             behind._set_bsdf(self.bsdf, -1)
         return behind
@@ -215,17 +214,6 @@ def _radiance(emitter: mi.Emitter) -> mi.Texture | None:
     if emitter.class_name() != "AreaLight":
         return None
     return next(node for node, (_, depth) in mi.traverse(emitter).hierarchy.items() if depth == 1)
-
-
-class _Nested(mi.TraversalCallback):
-    """Collects the objects that a plugin is made of, by name."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.objects: dict[str, Any] = {}
-
-    def put(self, name: str, value: Any, *_: Any) -> None:
-        self.objects[name] = value
 
 
 def _reflects_behind(flags: int) -> bool:

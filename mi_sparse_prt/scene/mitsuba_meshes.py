@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
+#: Parameters of meshes that are no attributes.
+_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+
 
 def read_mesh(shape: mi.Mesh, name: str) -> TriangleMesh:
     """The buffers of a Mitsuba mesh as NumPy copies."""
@@ -19,12 +22,20 @@ def read_mesh(shape: mi.Mesh, name: str) -> TriangleMesh:
         return np.array(buffer, dtype=dtype).reshape(-1, width).copy()
 
     n, t = shape.vertex_count(), shape.face_count()
-    vertex_attributes, face_attributes = {}, {}
-    for key in mi.traverse(shape).keys():
-        if key.startswith("vertex_") and key[7:] not in ("positions", "normals", "texcoords"):
-            vertex_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(n, -1)
-        elif key.startswith("face_"):
-            face_attributes[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(t, -1)
+    vertex_attributes: dict[str, NDArray[np.float32]] = {}
+    face_attributes: dict[str, NDArray[np.float32]] = {}
+    parameters = mi.traverse(shape)
+    # an `ellipsoidsmesh` has values for each ellipsoid, all of as many vertices and triangles, instead of attributes
+    ellipsoids = len(parameters["data"]) // 10 if shape.class_name() == "EllipsoidsMesh" else None
+    for key in parameters.keys():
+        if not key.startswith(("vertex_", "face_")) or key in _GEOMETRY:
+            continue
+        found, count = (vertex_attributes, n) if key.startswith("vertex_") else (face_attributes, t)
+        if ellipsoids is None:
+            found[key] = np.array(shape.attribute_buffer(key), np.float32).reshape(count, -1)
+        else:
+            values = np.array(parameters[key], np.float32).reshape(ellipsoids, -1)
+            found[key] = np.repeat(values, count // ellipsoids, axis=0)
     return TriangleMesh(
         name,
         rows(shape.vertex_positions_buffer(), 3, np.float32),

@@ -64,7 +64,8 @@ class Scene:
         Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal
         incidence.
     meshes : tuple of Mesh
-        The fronts of all shapes, then the backs of two-sided ones, as far as light can reach them.
+        The fronts of all shapes (those of instances last, one for each BSDF), then the backs of two-sided ones, as
+        far as light can reach them.
     fronts : tuple of Mesh
         The first of these, one for each shape.
     front_of : (n_v,) int64
@@ -145,7 +146,8 @@ class Scene:
         Parameters
         ----------
         scene : mi.Scene
-            Meshes, spheres, disks and cylinders; its sensors, emitters and integrator are reused, not copied.
+            Meshes; spheres, disks, cylinders, curves and ellipsoids, which become triangles; instances, which become
+            one mesh for each BSDF of their groups. Its sensors, emitters and integrator are reused, not copied.
         edge_length : float, optional
             World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of
             the scene's box / 64. `float("inf")` leaves meshes as they are.
@@ -153,8 +155,8 @@ class Scene:
         Raises
         ------
         PrtError
-            No mesh; a shape that is no surface of triangles (instances, curves, grids); positions or normals
-            that are not finite; an albedo outside [0, 1]; more than 5 million vertices.
+            No mesh; a shape that cannot become triangles (`sdfgrid`); positions or normals that are not finite; an
+            albedo outside [0, 1]; more than 5 million vertices.
         """
         result = cls._build(scene, edge_length)
         result._warn()

@@ -5,8 +5,7 @@ The rooms behind this one never look at Mitsuba shapes.
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.scene.curves import curve_mesh
+from mi_sparse_prt.scene.ellipsoids import ellipsoids_mesh
+from mi_sparse_prt.scene.instances import PlacedShape, merge_groups, moved, placed_shapes
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mesh_cleaning import (
     check_geometry,
@@ -45,7 +47,7 @@ def read_surfaces(
     Returns
     -------
     surfaces : list of (TriangleMesh, Material)
-        One for each shape; a mesh may have no triangles left.
+        One for each shape, and for each BSDF of the groups that have instances; a mesh may have no triangles left.
     notes : list of str
 
     Raises
@@ -58,23 +60,28 @@ def read_surfaces(
     if edge_length is not None and not edge_length > 0:
         raise PrtError(f"edge_length must be positive (or inf), not {edge_length}")
     most_vertices = 5_000_000  # 6144 directions would need 4 GB of visibility bits alone
-    shapes = scene.shapes()
-    if not shapes:
+    placed = placed_shapes(scene)
+    if not placed:
         raise PrtError("the scene has no mesh: add at least one shape")
     notes: list[str] = []
-    materials = [
-        Material(shape, name, notes) for shape, name in zip(shapes, _unique_names(shapes), strict=True)
-    ]
-    clean = [
-        _clean_mesh(s, m.name, notes) if s.is_mesh() else None for s, m in zip(shapes, materials, strict=True)
-    ]
+    materials = [Material(where.shape, where.name, notes) for where in placed]
+    clean, limit = [], most_vertices
+    for where in placed:
+        mesh = (
+            where.in_world(_clean_mesh(where.shape, where.name, notes), limit)
+            if where.shape.is_mesh()
+            else None
+        )
+        limit -= 0 if mesh is None else len(mesh.positions)
+        clean.append(mesh)
     if edge_length is None:
-        edge_length = _diagonal(shapes, clean) / 64
+        edge_length = _diagonal(placed, clean) / 64
 
-    meshes: list[TriangleMesh] = []
-    for shape, mesh, material in zip(shapes, clean, materials, strict=True):
-        limit = most_vertices - sum(len(m.positions) for m in meshes)
-        mesh = _tessellate(shape, material, edge_length, limit) if mesh is None else mesh
+    surfaces: list[tuple[TriangleMesh, Material]] = []
+    for where, mesh, material in zip(placed, clean, materials, strict=True):
+        limit = most_vertices - sum(len(other.positions) for other, _ in surfaces)
+        if mesh is None:
+            mesh = where.in_world(_tessellate(where, material, edge_length, limit), limit)
         if (
             not material.two_sided
             and not material.passes_light
@@ -85,47 +92,37 @@ def read_surfaces(
                 f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
                 "(set flip_normals, or use a twosided BSDF, if that is not meant)"
             )
-        if shape.is_mesh():
+        if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
-        meshes.append(mesh)
-    return list(zip(meshes, materials, strict=True)), notes
+        surfaces.append((mesh, material))
+    return merge_groups(placed, surfaces), notes
 
 
-def _unique_names(shapes: list[mi.Shape]) -> list[str]:
-    """A unique name for each shape: its id, else the name of its file, else its type and number."""
-    names: list[str] = ["type"]  # a reserved word in Mitsuba's dictionaries
-    for k, shape in enumerate(shapes):
-        name = shape.id()
-        if not name or name.startswith("_"):
-            file = re.search(r'name = "([^"]+)"', str(shape)) if shape.is_mesh() else None
-            name = Path(file.group(1)).stem if file else f"{shape.class_name().lower()}_{k}"
-        name = re.sub(r"[.\s/]", "_", name)
-        unique, suffix = name, 2
-        while unique in names:
-            unique, suffix = f"{name}_{suffix}", suffix + 1
-        names.append(unique)
-    return names[1:]
-
-
-def _diagonal(shapes: list[mi.Shape], clean: list[TriangleMesh | None]) -> float:
+def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> float:
     """The diagonal of the box around all shapes, in which unused vertices do not count."""
     points: list[NDArray] = []
-    for shape, mesh in zip(shapes, clean, strict=True):
-        if mesh is None:
-            box = shape.bbox()
-            points += [np.array(box.min).reshape(1, 3), np.array(box.max).reshape(1, 3)]
-        else:
+    for where, mesh in zip(placed, clean, strict=True):
+        if mesh is not None:
             points.append(mesh.positions)
+            continue
+        box = where.shape.bbox()
+        corners = np.array(list(product(*zip(np.array(box.min), np.array(box.max), strict=True))))
+        points += [corners] if where.copies is None else list(moved(corners, where.copies))
     return float(np.linalg.norm(np.ptp(np.concatenate(points).astype(np.float64), axis=0)))
 
 
-def _tessellate(shape: mi.Shape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
-    """The grid of a sphere, disk or cylinder, in world space; every other shape is refused."""
+def _tessellate(where: PlacedShape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
+    """Triangles of a shape that has none, in world space or that of its group; an unknown one is refused."""
+    shape, edge_length = where.shape, edge_length / where.largest_scale
+    if shape.class_name() in ("BSplineCurve", "LinearCurve"):
+        return curve_mesh(shape, edge_length, where.name, limit)
+    if shape.class_name() == "Ellipsoids":
+        return ellipsoids_mesh(shape, edge_length, where.name, limit)
     kind = {"Sphere": "sphere", "Disk": "disk", "Cylinder": "cylinder"}.get(shape.class_name())
     if kind is None:
         raise PrtError(
             f"shape '{material.name}' is of type {shape.class_name()}, which is not made of triangles: "
-            "replace it by a mesh (ply, obj), an instance by a copy of its shapes"
+            "replace it by a mesh (ply, obj)"
         )
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.

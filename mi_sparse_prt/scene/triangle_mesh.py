@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,6 +54,33 @@ class TriangleMesh:
             triangles=np.ascontiguousarray(self.triangles[index]),
             face_attributes={k: v[index] for k, v in self.face_attributes.items()},
         )
+
+
+def concatenated(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Meshes with normals as one, named as the first, with the texture coordinates and attributes that all have."""
+    first = meshes[0]
+    if len(meshes) == 1:
+        return first
+    offsets = np.cumsum([0, *(len(m.positions) for m in meshes[:-1])])
+    textured = all(m.texcoords is not None for m in meshes)
+
+    def joined(attributes: list[dict[str, NDArray[np.float32]]]) -> dict[str, NDArray[np.float32]]:
+        shared = [
+            k
+            for k, v in attributes[0].items()
+            if all(k in a and a[k].shape[1] == v.shape[1] for a in attributes)
+        ]
+        return {k: np.concatenate([a[k] for a in attributes]) for k in shared}
+
+    return TriangleMesh(
+        first.name,
+        np.concatenate([m.positions for m in meshes]),
+        np.concatenate([m.normals for m in meshes if m.normals is not None]),
+        np.concatenate([m.triangles + k for m, k in zip(meshes, offsets, strict=True)]).astype(np.int32),
+        np.concatenate([m.texcoords for m in meshes if m.texcoords is not None]) if textured else None,
+        joined([m.vertex_attributes for m in meshes]),
+        joined([m.face_attributes for m in meshes]),
+    )
 
 
 def triangle_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
