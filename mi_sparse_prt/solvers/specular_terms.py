@@ -94,9 +94,13 @@ class _TermWalks(SpecularRays):
             ray, row, rng = self._rays(ids, rows[some], parts[some], STRATA, seed)
             point = dr.gather(mi.UInt32, mi.UInt32(np.asarray(ids).astype(np.uint32)), row)
             into, of_lane = _weights(lobes, point, ray.d), row.numpy().astype(np.int64)
-            for lanes, texels, light, hits in self._walked(ray, dr.arange(mi.UInt32, len(of_lane)), rng):
-                ends, sky = lanes[~hits], light[~hits] / np.float32((PARTS * STRATA) ** 2)
-                yield _Light(of_lane[ends], texels[~hits], into[ends], sky)
+            for ends in self._walked(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True):
+                kept = ends.valid.numpy()
+                lanes, texels, light = (
+                    x[kept] for x in (ends.row.numpy(), ends.column.numpy(), ends.weight.numpy().T)
+                )
+                share = light / np.float32((PARTS * STRATA) ** 2)
+                yield _Light(of_lane[lanes], texels.astype(np.int64), into[lanes], share)
 
 
 def _straight(problem: Problem, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
