@@ -20,7 +20,6 @@ from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.methods.sparse import SparseOptions, sparse_parts
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
@@ -135,9 +134,8 @@ class Execution:
             gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
         with clock.phase("interreflection"):
             if sources is problem:
-                specular = () if light.specular is None else (light.specular.operator,)
-                sent = Sum((light.direct, *specular)) if specular else light.direct
-                part = gather.indirect(sent, plan.tolerance)
+                specular = None if light.specular is None else light.specular.operator
+                part = gather.indirect(light.direct, plan.tolerance, specular)
             else:
                 part = gather.seen_from(problem.points, known.direct, plan.tolerance)
         rays = light.rays | {"gather": gather.rays}

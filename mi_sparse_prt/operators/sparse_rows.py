@@ -9,7 +9,6 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_nbytes, sparse_to_arrays
 from mi_sparse_prt.emission.space import EmissionSpace
@@ -18,7 +17,7 @@ from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 @dataclass(frozen=True)
 class SparseRows(Operator):
-    """Light of few directions; where it comes from is not where its texels are, so that no horizon hides it.
+    """Light that arrives from few directions.
 
     Attributes
     ----------
@@ -63,9 +62,6 @@ class SparseRows(Operator):
 
     def _adjoint(self, y: Floats) -> Floats:
         return np.stack([matrix.T @ y[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
-
-    def masked(self, points: NDArray[np.int64], open: Bits) -> SparseRows:
-        return self
 
     def take(self, ids: Ids) -> SparseRows:
         return replace(self, matrices=tuple(matrix[np.asarray(ids)] for matrix in self.matrices))

@@ -27,6 +27,7 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
@@ -189,7 +190,9 @@ class FiniteElements:
     def _transposed(self) -> scipy.sparse.csr_array:
         return self.matrix.T.tocsr()
 
-    def indirect(self, direct: Operator, tolerance: float = 0.03) -> Gathered:
+    def indirect(
+        self, direct: Operator, tolerance: float = 0.03, specular: Operator | None = None
+    ) -> Gathered:
         """Indirect light for all texels, factored.
 
         Parameters
@@ -198,12 +201,16 @@ class FiniteElements:
             The direct part of the matrix, with a row for each vertex.
         tolerance : float
             Relative L2 error of the first bounce that a low rank may cost; later bounces are smoother and lose less.
+        specular : Operator, optional
+            Light by way of mirrors and glass, which surfaces reflect as well; no horizon hides it.
 
         Returns
         -------
         Gathered
         """
         direct = self._lit(direct)
+        if specular is not None:
+            direct = Sum((direct, specular))
         count = self._count_for(direct)
         if count == 0:
             left = np.zeros((self._albedo.shape[1], 0), np.float32)
