@@ -82,20 +82,22 @@ def read_surfaces(
         limit = most_vertices - sum(len(other.positions) for other, _ in surfaces)
         if mesh is None:
             mesh = where.in_world(_tessellate(where, material, edge_length, limit), limit)
-        if (
-            not material.two_sided
-            and not material.passes_light
-            and len(mesh.triangles)
-            and faces_inwards(mesh)
-        ):
-            notes.append(
-                f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
-                "(set flip_normals, or use a twosided BSDF, if that is not meant)"
-            )
+        _note_if_inwards(mesh, material, notes)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
         surfaces.append((mesh, material))
     return merge_groups(placed, surfaces), notes
+
+
+def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: list[str]) -> None:
+    """Note a closed shape that is black from outside."""
+    if material.two_sided or material.passes_light or not len(mesh.triangles):
+        return
+    if faces_inwards(mesh):
+        notes.append(
+            f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
+            "(set flip_normals, or use a twosided BSDF, if that is not meant)"
+        )
 
 
 def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> float:

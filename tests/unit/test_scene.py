@@ -662,9 +662,8 @@ def test_inward_faces_are_warned_about(shape: dict, warns: bool) -> None:
         ('<shape type="cube"><float name="colour" value="1"/></shape>', "colour"),
         ('<shape type="ply"><string name="filename" value="gone.ply"/></shape>', "gone.ply"),
         (
-            '<shape type="shapegroup" id="g"><shape type="cube"/></shape>'
-            '<shape type="instance" id="twin"><ref id="g"/></shape>',
-            "shape 'twin' is of type Instance, which is not made of triangles: replace it",
+            f'<shape type="sdfgrid" id="blob"><string name="filename" value="{SCENES / "zoo/blob.vol"}"/></shape>',
+            "shape 'blob' is of type SDFGrid, which is not made of triangles: replace it by a mesh",
         ),
         (
             '<shape type="disk" id="dot"><transform name="to_world"><scale value="0"/></transform></shape>',
