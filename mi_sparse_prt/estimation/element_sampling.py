@@ -58,7 +58,7 @@ class Effort:
 
     rays: float = 0.002
     fewest_rays: int = 1 << 16
-    paths: int = 4096
+    paths: int = 6144
     few_paths: int = 512
     fewest_paths: int = 64
     spp: int = 512
