@@ -199,6 +199,8 @@ def digest(text: str, parameters: mi.SceneParameters, left_out: tuple[str, ...] 
     """SHA-256 of an object's text, of all parameters that `mi.traverse` shows, and of how bitmaps are looked up."""
     state = hashlib.sha256(text.encode())
     for name in sorted(set(parameters.keys()) - set(left_out)):
+        if parameters.properties[name][0] is None:  # a texture that is not given, which cannot be asked for
+            continue
         value = parameters[name]
         state.update(name.encode())
         state.update(np.array(value.matrix if hasattr(value, "matrix") else value).tobytes())

@@ -759,3 +759,14 @@ def test_shipped_meshes_are_what_their_scripts_make(
 def test_shipped_scenes_hash_alike_at_every_load() -> None:
     hashes = {load_scene(SCENES / "dancer.xml").hash for _ in range(3)}
     assert len(hashes) == 1
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_textures_that_are_not_given_have_no_hash() -> None:
+    """Of a hair BSDF with pigments there is no absorption to be read; other pigments are another scene."""
+    hashes = []
+    for pigment in (0.3, 0.3, 0.6):
+        hair = {"type": "hair", "eumelanin": pigment, "pheomelanin": 0.1}
+        original = mi.load_dict({"type": "scene", "s": {"type": "rectangle", "bsdf": hair}})
+        hashes.append(Scene.from_mitsuba(original, INF).hash)
+    assert hashes[0] == hashes[1] != hashes[2]
