@@ -23,9 +23,9 @@ from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_o
 from mi_sparse_prt.methods.lamps import SPP, gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
-from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
+from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
-from mi_sparse_prt.planner.choice import TARGET, WORST_FACTOR, Predicted
+from mi_sparse_prt.planner.choice import WORST_FACTOR, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
@@ -33,7 +33,7 @@ from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflecti
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.specular import specular_light
 from mi_sparse_prt.solvers.specular_terms import with_term_rows
 from mi_sparse_prt.transport import LightTransport
 
@@ -163,7 +163,7 @@ def precompute(
         return _lit_by_lamps(problem, settings, run)
     with run.clock.phase("setup"):
         seen, settings = _reflection(scene, where, settings)
-        apart = scene.specular and where.kind == "vertices" and max_depth != 2
+        apart = scene.specular and max_depth != 2
         problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
@@ -178,8 +178,7 @@ class _Attempts:
         specular = None
         if self._dark is None and self._problem.specular_apart:
             with run.clock.phase("specular"):
-                options = SpecularOptions(error=(settings.target_error or TARGET) / 1.5)
-                specular = specular_light(self._problem, run.seed, options)
+                specular = specular_light(self._problem, run.seed, settings.specular)
                 if self._problem.reflection.terms:
                     specular = with_term_rows(self._problem, specular, run.seed)
         self._proposals = _proposals(direct, settings, self._dark is None, run.clock)

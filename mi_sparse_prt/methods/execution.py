@@ -30,7 +30,7 @@ from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import Gathered, RadiositySolver
-from mi_sparse_prt.solvers.specular import SpecularLight
+from mi_sparse_prt.solvers.specular import SpecularLight, SpecularOptions, specular_light
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.transport import LightTransport
@@ -128,20 +128,30 @@ class Execution:
         problem, clock = self._problem, self._run.clock
         sources, known = problem.at_vertices, light
         if sources is not problem:  # vertices know the light that surfaces send out
-            known = exact_direct(DirectSolver(replace(sources, basis="direction")), self._run)
+            known = self._direct_of(sources)
         with clock.phase("gather_rays"):
             nodes = choose_nodes(problem.scene, sources.points)
             gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
         with clock.phase("interreflection"):
+            specular = None if known.specular is None else known.specular.operator
             if sources is problem:
-                specular = None if light.specular is None else light.specular.operator
                 part = gather.indirect(light.direct, plan.tolerance, specular)
             else:
-                part = gather.seen_from(problem.points, known.direct, plan.tolerance)
+                part = gather.seen_from(problem, known.direct, plan.tolerance, specular)
         rays = light.rays | {"gather": gather.rays}
         if known is not light:
             rays["direct"] += known.rays["direct"]
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
+
+    def _direct_of(self, sources: Problem) -> MethodResult:
+        """Direct and specular light of the vertices, which send it on to other points."""
+        known = exact_direct(DirectSolver(replace(sources, basis="direction")), self._run)
+        if not sources.specular_apart:
+            return known
+        few = SpecularOptions(
+            last=4
+        )  # noise of single vertices: points see many, whose mean has little of it
+        return replace(known, specular=specular_light(sources, self._run.seed, few))
 
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
         """With interreflections among glossy surfaces."""

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.methods.plan import BY_NAME, TOGETHER, Plan
+from mi_sparse_prt.solvers.specular import SpecularOptions
 
 METHODS = ("auto", *BY_NAME)
 BASES = ("direction", "texel")
 SPP = 16
+TARGET = 0.02  # error to aim at, where none is given
 AUTO_TERMS = "auto"
 
 
@@ -103,6 +105,11 @@ class Settings:
     def _needs_vertices(self) -> bool:
         """Whether the method compares points with their neighbours on a mesh."""
         return self.plan is not None and self.plan.direct in ("consensus", *TOGETHER)
+
+    @property
+    def specular(self) -> SpecularOptions:
+        """How light that arrives by way of mirrors and glass is looked for."""
+        return SpecularOptions(error=(self.target_error or TARGET) / 1.5)
 
     @property
     def view_dependent(self) -> bool:

@@ -8,9 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
-from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import (
-    TARGET,
     Costs,
     Predicted,
     better,

@@ -12,12 +12,12 @@ from scipy.special import ndtr, ndtri
 
 from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.methods.plan import DENSE, GATHER, Plan
+from mi_sparse_prt.methods.settings import TARGET
 from mi_sparse_prt.planner.direct_costs import DirectCost
 from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
 
-TARGET = 0.02  # where none is given
 MARGIN = 0.95  # of a target is aimed at by paths, whose number is free
 SPREAD = 0.1  # standard deviation of predicted errors from those found, relative; of 41 plans on three scenes
 SAFE = 1.1  # by what factor a plan for after a miss is below the target: that miss tells how far off predictions are

@@ -7,8 +7,8 @@ from dataclasses import replace
 from mi_sparse_prt.estimation.element_sampling import Effort
 from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
-from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.choice import MARGIN, TARGET, Costs, choose, predictions
+from mi_sparse_prt.methods.settings import TARGET, Settings
+from mi_sparse_prt.planner.choice import MARGIN, Costs, choose, predictions
 from mi_sparse_prt.planner.direct_costs import consensus_cost, edges_cost, exact_cost
 from mi_sparse_prt.planner.path_costs import (
     COARSEST,

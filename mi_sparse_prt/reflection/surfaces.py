@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -157,20 +158,23 @@ def _with_factors(scene: Scene, find: Find, harmonics: int | None = None) -> InO
         if not own.diffuse:
             alike.setdefault(own.digest(), []).append(k)
     material, albedo, factors = np.full(scene.n_vertices, -1), scene.albedo.copy(), list[BrdfFactors]()
+    beside = cache(lambda: beside_vertices(scene))  # of few scenes, but of all meshes there
     for some in alike.values():
         found = find(scene.materials[some[0]], [scene.meshes[k].name for k in some])
         if found is None:
             continue
         for k in some:
             material[scene.meshes[k].vertices] = len(factors)
-            albedo[scene.meshes[k].vertices] = _diffuse_part(scene, k, found)
+            albedo[scene.meshes[k].vertices] = _diffuse_part(scene, k, found, beside)
         factors.append(found)
     if not factors:
         return None
     return InOutFactors(albedo, vertex_tangents(scene), scene.normals, material, tuple(factors), harmonics)
 
 
-def _diffuse_part(scene: Scene, number: int, factors: BrdfFactors) -> NDArray[np.floating]:
+def _diffuse_part(
+    scene: Scene, number: int, factors: BrdfFactors, beside: Callable[[], mi.SurfaceInteraction3f]
+) -> NDArray[np.floating]:
     """Its reflectance, (channels,) or (vertices, 3), on one of a scene's meshes."""
     mesh, own = scene.meshes[number], scene.materials[number]
     textured = scene.mitsuba.shapes()[mesh.shape].has_vertex_texcoords()
@@ -179,5 +183,4 @@ def _diffuse_part(scene: Scene, number: int, factors: BrdfFactors) -> NDArray[np
     if not factors.varying_diffuse:
         return factors.diffuse
     here = dr.arange(mi.UInt32, mesh.vertices.start, mesh.vertices.stop)
-    beside = dr.gather(mi.SurfaceInteraction3f, beside_vertices(scene), here)
-    return diffuse_reflectance(own.bsdf, mesh.name, beside)
+    return diffuse_reflectance(own.bsdf, mesh.name, dr.gather(mi.SurfaceInteraction3f, beside(), here))

@@ -24,6 +24,7 @@ from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
+from mi_sparse_prt.scene.traversal import places_of_lamps
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, triangle_keys
 
 FEW_MESHES = 12  # more are sampled together: what each took would grow with shapes, not with vertices
@@ -115,7 +116,8 @@ class Scene:
         self._surfaces = meshes
 
         albedo = [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
-        backs, self.dark_backs = find_backs(self.normalised, meshes, materials)
+        lamps = self._normalise(places_of_lamps(mitsuba))
+        backs, self.dark_backs = find_backs(self.normalised, meshes, materials, lamps)
         behind = {back.shape: materials[back.shape].back() for back in backs}
         reflected = {k: own.albedo(world[k], meshes[k]) for k, own in behind.items()}
         backs = [back for back in backs if reflected[back.shape].any()]
@@ -259,7 +261,8 @@ class Scene:
         """SHA-256 (hex) of geometry and materials, whatever the order of shapes, vertices and triangles.
 
         Merging meshes of one material does not change it; moving a vertex, or changing an albedo, a texture or
-        any parameter that a BSDF shows, does.
+        any parameter that a BSDF shows, does. So does a lamp that is carried into a closed room, whose walls then have
+        vertices inside.
         """
         total = np.zeros(2, np.uint64)
         digests = set()
@@ -273,6 +276,8 @@ class Scene:
                 total[1] += np.sum(mix(keys ^ np.uint64(0x5851F42D4C957F2D)), dtype=np.uint64)
         count = sum(len(mesh.triangles) for mesh in self.fronts)
         parts = [total.tobytes(), str(count).encode(), *sorted(digests)]
+        behind = self.n_vertices - len(self.backs)
+        parts += [str(behind).encode()] if behind else []  # a lamp in a closed room lights its backs
         return hashlib.sha256(b"|".join(parts)).hexdigest()
 
     @property

@@ -53,12 +53,15 @@ class Back:
 
 
 def find_backs(
-    scene: mi.Scene, meshes: Sequence[TriangleMesh], materials: Sequence[Material]
+    scene: mi.Scene,
+    meshes: Sequence[TriangleMesh],
+    materials: Sequence[Material],
+    lamps: NDArray[np.float32] | None = None,
 ) -> tuple[list[Back], list[str]]:
     """The backs of two-sided surfaces that light can reach, and the names of shapes that have others as well.
 
     Light reaches a connected piece of a surface if a ray from its back leaves the scene, or meets the front of a
-    surface, one that light passes through, or the back of another piece that light reaches.
+    surface, one that light passes through, or the back of another piece that light reaches; or if a lamp shines on it.
 
     Parameters
     ----------
@@ -66,6 +69,8 @@ def find_backs(
         In the normalised frame: one shape for each mesh, which are in world space.
     meshes : sequence of TriangleMesh
     materials : sequence of Material
+    lamps : (n, 3) float32, optional
+        Places of lamps that are no surfaces, normalised.
 
     Notes
     -----
@@ -75,7 +80,7 @@ def find_backs(
     if not any(material.two_sided for material in materials):
         return [], []
     pieces = _pieces(meshes, materials)
-    bright = _bright_pieces(scene, meshes, pieces)
+    bright = _bright_pieces(scene, meshes, pieces, np.zeros((0, 3), np.float32) if lamps is None else lamps)
     found, dark, first = [], [], 0
     for shape, mesh in enumerate(meshes):
         own = pieces[first : first + len(mesh.triangles)]
@@ -117,11 +122,15 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
     return np.concatenate(result)
 
 
-def _bright_pieces(scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids) -> NDArray[np.bool_]:
+def _bright_pieces(
+    scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids, lamps: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """Which pieces light reaches, (pieces,) bool."""
     n = int(pieces.max()) + 1
     sees_light, seen = np.zeros(n, np.bool_), [np.zeros((0, 2), np.int64)]
     looks = _Looks(scene, meshes, pieces)
+    for lamp in lamps:
+        sees_light[looks.from_place(lamp)] = True
     size = np.bincount(pieces[pieces >= 0], minlength=n)
     for pass_, rays in enumerate((FEW_RAYS, MANY_RAYS)):
         some = np.flatnonzero(pieces >= 0)
@@ -182,18 +191,28 @@ class _Looks:
         start = np.repeat(triangles, each)
         sample = np.arange(len(start)) - np.repeat(np.cumsum(each) - each, each)
         triangle = mi.UInt32(start.astype(np.uint32))
-        ray = self._rays(triangle, mi.UInt32(sample.astype(np.uint32)), seed)
-        hit = self._scene.ray_intersect_preliminary(ray)
-        met = hit.is_valid()
-        index = dr.select(met, self._first.gather(hit.shape, met) + hit.prim_index, 0)
-        # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
-        behind = met & (dr.dot(dr.gather(mi.Vector3f, self._backwards, index), ray.d) < 0)
-        other = np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)
+        other = self._met(self._rays(triangle, mi.UInt32(sample.astype(np.uint32)), seed))
         own = self._pieces[start]
         facing = other >= 0
         return np.unique(own[other == PASSES_LIGHT]), np.unique(
             np.stack([own[facing], other[facing]], axis=1), axis=0
         )
+
+    def from_place(self, place: NDArray[np.float32]) -> Ids:
+        """Pieces whose backs are seen from a point (3,), looking around."""
+        rng = mi.PCG32(size=MANY_RAYS)
+        direction = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        met = self._met(mi.Ray3f(mi.Point3f(place), direction))
+        return np.unique(met[met >= 0])
+
+    def _met(self, ray: mi.Ray3f) -> Ids:
+        """The piece whose back each ray meets; NO_PIECE of a black one, PASSES_LIGHT for all else."""
+        hit = self._scene.ray_intersect_preliminary(ray)
+        met = hit.is_valid()
+        index = dr.select(met, self._first.gather(hit.shape, met) + hit.prim_index, 0)
+        # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
+        behind = met & (dr.dot(dr.gather(mi.Vector3f, self._backwards, index), ray.d) < 0)
+        return np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)
 
     def _rays(self, triangle: mi.UInt32, sample: mi.UInt32, seed: int) -> mi.Ray3f:
         rng = random_generator(dr.gather(mi.UInt64, self._keys, triangle), sample, mi.UInt32(0), seed)

@@ -5,6 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+
+def places_of_lamps(scene: mi.Scene) -> NDArray[np.float32]:
+    """Where lamps are (n, 3) that shine from single points (world): ``point``, ``spot``, ``projector``."""
+    places = [np.zeros((0, 3))]
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            at = mi.traverse(emitter)
+            place = at["position"] if "position" in at else at["to_world"].translation()
+            places.append(np.ravel(place)[None])
+    return np.concatenate(places).astype(np.float32)
 
 
 def children(thing: mi.Object) -> list[tuple[str, Any]]:

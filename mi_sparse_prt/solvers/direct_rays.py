@@ -139,13 +139,14 @@ class DirectSolver:
     def trace(self, point: mi.UInt32, direction: mi.Vector3f, active: mi.Mask) -> tuple[mi.Mask, mi.Float]:
         """Which points see the sky in a direction (unit, world), and the cosine; lanes side by side.
 
-        Below the horizon no ray is traced and nothing is seen. Surfaces are in the way unless they let all light pass.
+        Below the horizon no ray is traced and nothing is seen. Surfaces are in the way; where specular light is apart,
+        those are not that let all light pass.
         """
         cosine = dr.dot(self._points.normal(point), direction)
         active &= cosine > 0
         ray = start_ray(self._points, point, direction)
         blocked = self.scene.ray_test(ray, active=active)
-        if self.problem.scene.passes_straight:
+        if self.problem.specular_apart and self.problem.scene.passes_straight:
             blocked &= self._transmittance(ray, active & blocked) < ALL
         return active & ~blocked, cosine
 

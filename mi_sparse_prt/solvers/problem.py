@@ -71,7 +71,8 @@ class Problem:
         if self.measurement.kind == "vertices":
             return self
         depth = self.max_depth if self.max_depth < 0 else self.max_depth - 1
-        return replace(diffuse_problem(self.scene, self.emission, depth), basis=self.basis)
+        diffuse = diffuse_problem(self.scene, self.emission, depth)
+        return replace(diffuse, basis=self.basis, specular_apart=self.specular_apart)
 
 
 def diffuse_problem(scene: Scene, emission: Any, max_depth: int = 5) -> Problem:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
@@ -356,22 +355,27 @@ class RadiositySolver(FiniteElements):
         self.rays = len(nodes) * rays_per_vertex
         self._scene, self._rays_per_vertex = scene, rays_per_vertex
 
-    def seen_from(self, points: Points, direct: Operator, tolerance: float) -> Gathered:
+    def seen_from(
+        self, problem: Problem, direct: Operator, tolerance: float, specular: Operator | None = None
+    ) -> Gathered:
         """Indirect light at points that are no vertices, from direct light of the vertices: F (V_p + G_p ...).
 
         Parameters
         ----------
-        points : Points
+        problem : Problem
+            At these points; ``max_depth`` counts from them.
         direct : Operator
             Of the vertices.
-        tolerance : float
-            As for ``indirect``; ``max_depth`` counts from the points.
+        tolerance, specular
+            As for ``indirect``.
         """
-        matrix = gather_matrix(self._scene, points, self._rays_per_vertex, self.seed)
+        points, every = problem.points, np.arange(len(problem.points))
+        matrix = form_factors(problem, self._rays_per_vertex, self.seed, every)
         self.rays += len(points) * self._rays_per_vertex
         lit = self._lit(direct)
+        lit = lit if specular is None else Sum((lit, specular))
         first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
-        before = self.indirect(direct, tolerance)  # what vertices receive, one bounce before
+        before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
         again = [
             multiply_scaled(matrix, rho[None], x)[0] for rho, x in zip(self._albedo, before.left, strict=True)
         ]

@@ -312,7 +312,8 @@ def _moved_to_hits(
     ids, columns = np.meshgrid(rows.ids, elements, indexing="ij")
 
     def direct(points: Points, basis: str) -> Floats:
-        problem = replace(diffuse_problem(scene, transport.emission), basis=basis).at(points)
+        problem = diffuse_problem(scene, transport.emission, transport.max_depth)
+        problem = replace(problem, basis=basis, specular_apart="specular" in transport.operators).at(points)
         listed = ids.ravel(), columns.ravel()
         if distant:
             unit_albedo = DirectSolver(problem, STRATA, seed).elements(*listed)[:, None]

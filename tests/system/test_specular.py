@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.measurement.pixels import camera_pixels
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -121,6 +123,33 @@ def test_each_surface_on_the_way_counts():
     ]
     assert not lit[0].any()
     assert lit[1] == pytest.approx(0.5, abs=0.02)
+
+
+def test_pixels_see_by_way_of_mirrors_and_glass():
+    """Expected: at the points that a camera sees, light that is gathered is that of paths, and none is counted twice.
+
+    The mean over all pixels differs by less than 1% (3 seeds: 0.2 to 0.3%). Paths that count light again which passed
+    straight through surfaces find 6% more, and gathering without what arrives by mirrors and glass 11% less.
+    """
+    shapes = {name: shape for name, shape in objects(0.6).items() if name != "cut"}
+    scene, lighting = build(0.2, **shapes), prt.CubemapLighting(4)
+    camera = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": T().look_at([0.5, 2.2, 4], [0, 0.4, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 18, "rfilter": {"type": "box"}},
+        }
+    )
+    pixels, light = camera_pixels(scene, camera, 4), np.repeat([[3.0] * 3, [1.0] * 3], 48, axis=0)
+    means = []
+    for method, spp in (("gather", None), ("brute_force", 16)):
+        transport = prt.precompute(
+            scene, lighting, method, "texel", -1, spp, measurement=pixels, strata=4, progress=False
+        )
+        means.append(float(transport.relight(light).mean()))
+    print(f"gathered {means[0]:.4f}, by paths {means[1]:.4f}")
+    assert means[0] == pytest.approx(means[1], rel=0.01)
 
 
 def test_light_falls_through_holes():

@@ -123,6 +123,45 @@ def test_only_the_pieces_that_light_reaches():
     )
 
 
+@pytest.mark.parametrize("lamp", ["point", "spot", "projector", None])
+def test_a_lamp_lights_a_closed_room(lamp):
+    """Expected: the inside of a closed two-sided box has vertices if, and only if, a lamp shines in it."""
+    pose = T().look_at([0, 1, 0], [0.3, 0, 0.1], [0, 0, 1])
+    lamps = {
+        "point": {"type": "point", "position": [0, 1, 0]},
+        "spot": {"type": "spot", "to_world": pose},
+        "projector": {
+            "type": "projector",
+            "to_world": pose,
+            "irradiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
+        },
+        None: {"type": "point", "position": [0, 5, 0]},
+    }
+    scene = build(0.5, **walls(6, twosided(RED)), lamp=lamps[lamp])
+    inside = [mesh.name for mesh in scene.meshes if mesh.name.endswith("_back")]
+    assert inside == ([f"wall_{k}_back" for k in range(6)] if lamp else [])
+    assert len(scene.dark_backs) == (0 if lamp else 6)
+    assert scene.hash != build(0.5, **walls(6, twosided(RED)), lamp=lamps[None]).hash or lamp is None
+
+
+def test_a_room_with_a_lamp_is_not_black():
+    """Expected: ``sparse_prt`` shows a closed two-sided room lit by a point as ``path`` does (mean within 2%)."""
+    camera = {
+        "type": "perspective",
+        "fov": 80,
+        "to_world": T().look_at([0.3, 1.2, 0.3], [-0.3, 0.9, -0.5], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 32, "height": 24, "rfilter": {"type": "box"}},
+    }
+    shapes = {**walls(6, twosided(RED)), "lamp": {"type": "point", "position": [0, 1.2, 0.1]}}
+    scene = mi.load_dict({"type": "scene", **shapes, "camera": camera})
+    ours, known = (
+        np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": 5, **more}), spp=256))
+        for kind, more in (("sparse_prt", {"progress": False}), ("path", {}))
+    )
+    assert known.mean() > 0.1
+    assert ours.mean() == pytest.approx(known.mean(), rel=0.02)
+
+
 def test_a_leaf_alone_is_lit_analytically():
     """Expected: nothing is in the way, so each sheet has the directions on its side, by their cosines."""
     scene, lighting = build(leaf=leaf(twosided(RED, BLUE))), prt.CubemapLighting(8)
