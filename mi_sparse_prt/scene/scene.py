@@ -108,8 +108,9 @@ class Scene:
             build_mitsuba_mesh(m, k.bsdf, positions=self._normalise(m.positions))
             for m, k in zip(meshes, materials, strict=True)
         ]
-        # An area emitter may outlive its shape, and Mitsuba then reads freed memory: the original is kept
-        self._original = mitsuba
+        # An area emitter may outlive its shape, and Mitsuba then reads freed memory: these are kept. Others are not:
+        # each instance that is alive makes every kernel slower to trace
+        self._original = [shape for shape in mitsuba.shapes() if shape.is_emitter()]
         names = [mesh.name for mesh in meshes]
         self.mitsuba: mi.Scene = build_mitsuba_scene(world, names, mitsuba)
         self.normalised: mi.Scene = build_mitsuba_scene(unit, names)
