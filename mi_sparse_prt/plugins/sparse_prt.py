@@ -14,6 +14,7 @@ from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
+from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.scene.scene import Scene
@@ -152,14 +153,15 @@ class SparsePRT(mi.SamplingIntegrator):
         depth = self._settings["max_depth"]
         if lamps and depth != 2:
             irradiance += self._light_of_lamps(surfaces)
+        followed = surfaces_to_follow(surfaces) if self._settings["terms"] else []
         if environment is None:
-            return [RelitScene(surfaces, irradiance, None, max_depth=depth)]
+            return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         if not transport.terms:
             irradiance += transport.irradiance(environment)
-            return [RelitScene(surfaces, irradiance, environment, max_depth=depth)]
+            return [RelitScene(surfaces, irradiance, environment, None, depth, followed)]
         relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment)]
-        return [*relit, RelitScene(surfaces, irradiance, None, max_depth=depth)] if lamps else relit
+        return [*relit, RelitScene(surfaces, irradiance, None, None, depth, followed)] if lamps else relit
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (n_v, 3) of light of lamps that was reflected at least once before."""

@@ -1,12 +1,13 @@
 """R and M at the pixels of a camera: vertex irradiance, interpolated, times the albedo at the pixel ([Leh07] 2.4).
 
 Rays go on through mirrors, glass and masks, by Mitsuba's own samples of what these scatter into single directions,
-until they meet no more of it.
+until they meet no more of it. They go on in the same way from glossy surfaces that no in-out factors stand for, by all
+that these scatter (``relighting.followed_rays``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -22,13 +23,21 @@ from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
+from mi_sparse_prt.relighting.followed_rays import (
+    Seen,
+    Way,
+    background_light,
+    follow,
+    is_one_of,
+    reflected_background,
+    surfaces_to_follow,
+)
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
 from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
 _SEEDS = 9973  # passes of neighbouring seeds stay apart
-MOST_MIRRORS = 64  # that a ray meets, where ``max_depth`` sets no limit
 
 Corner = tuple[
     Any, Any
@@ -50,6 +59,8 @@ class RelitScene:
     max_depth : int
         As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts. That light of the vertices has
         made fewer bounces then is left out of account.
+    followed : sequence of mi.BSDF, optional
+        Of surfaces that rays go on from by all that these scatter.
     """
 
     def __init__(
@@ -59,10 +70,11 @@ class RelitScene:
         background: mi.Emitter | None,
         lamps: tuple[SampledEmission, NDArray[np.float32]] | None = None,
         max_depth: int = -1,
+        followed: Sequence[mi.BSDF] = (),
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
-        self._most = max_depth if 0 <= max_depth < MOST_MIRRORS else MOST_MIRRORS
-        self._goes_on = any(material.single_directions for material in scene.materials)
+        self.max_depth, self.followed = max_depth, followed
+        self._goes_on = scene.specular or bool(followed)
         self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
@@ -73,34 +85,38 @@ class RelitScene:
     def radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
         if self._goes_on:
-            return follow_single_directions(self._seen, ray, sampler, active, self._most)
-        value, si = self._met(ray, mi.Point2f(0.5), active, active)
-        return value, active & si.is_valid()
+            return follow(self._seen, ray, sampler, active, self.max_depth)
+        found = self._met(ray, mi.Point2f(0.5), active, active)
+        value = found.radiance
+        if self._background is not None:
+            value = dr.select(active & ~found.si.is_valid(), self._background.eval(found.si, active), value)
+        return value, active & found.si.is_valid()
 
-    def _seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, depth: mi.UInt32, last: mi.Mask, active: mi.Mask
-    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
-        """See ``follow_single_directions``."""
+    def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
+        """See ``follow``."""
         u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
-        return self._met(ray, u, active, active & ~last)
+        value, si, whole = self._met(ray, u, active, active & ~way.last)
+        if self._background is not None:
+            value += background_light(self._background, ray, way, active & ~si.is_valid())
+            if self.followed:
+                reflects = active & ~way.last & whole
+                value += reflected_background(self._background, self._scene, si, sampler, reflects)
+        return Seen(value, si, whole)
 
-    def _met(
-        self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask
-    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
-        """Radiance of what rays meet, which is that of surfaces only where these are asked for, and what that is."""
+    def _met(self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask) -> Seen:
+        """What rays meet; with the radiance of surfaces only where these are asked for, and are not followed."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
-        valid = reflects & si.is_valid()
+        whole = is_one_of(self.followed, si)
+        valid = reflects & si.is_valid() & ~whole
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
         corners, lit = self._hit_corners(hit, valid, behind)
         value = dr.select(lit, self._shaded(si, corners, u, lit), 0)
-        if self._background is not None:
-            value = dr.select(active & ~si.is_valid(), self._background.eval(si, active), value)
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
-        return value, si
+        return Seen(value, si, whole)
 
     def _hit_corners(
         self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask, behind: mi.Mask
@@ -129,61 +145,12 @@ class RelitScene:
         reflected = dr.select(diffuse, bsdf.eval_diffuse_reflectance(si, valid), albedo)
         if self._goes_on:
             # a share of it is diffuse: what a random direction finds is that share, on average over all directions
-            shared = _scatters_into_single_directions(bsdf) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
+            shared = mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
             out = mi.warp.square_to_cosine_hemisphere(u)
             out.z = dr.mulsign(out.z, mi.Frame3f.cos_theta(si.wi))
             value = bsdf.eval(mi.BSDFContext(), si, out, valid & shared)
             reflected = dr.select(shared, value * dr.pi / dr.maximum(dr.abs(out.z), 1e-6), reflected)
         return irradiance * reflected
-
-
-@dr.syntax
-def follow_single_directions(
-    seen: Callable[..., tuple[mi.Color3f, mi.SurfaceInteraction3f]],
-    ray: mi.Ray3f,
-    sampler: mi.Sampler,
-    active: mi.Mask,
-    most: int,
-) -> tuple[mi.Color3f, mi.Mask]:
-    """What rays see that go on through mirrors, glass and masks, and whether they meet any surface.
-
-    Parameters
-    ----------
-    seen : callable
-        Of a ray, the sampler, how many surfaces it met before, whether none may reflect after these, and whether it is
-        active: the radiance of what it meets, but for what that scatters into single directions, and what it meets.
-    ray : Ray3f, world
-    sampler : Sampler
-    active : Mask
-    most : int
-        Surfaces and the light after them, as ``max_depth``.
-    """
-    context = mi.BSDFContext()
-    context.type_mask = int(mi.BSDFFlags.Delta)
-    ray, active = mi.Ray3f(ray), mi.Mask(active)
-    total, throughput = mi.Color3f(0), mi.Color3f(1)
-    depth, valid = mi.UInt32(0), mi.Mask(False)
-    limit = dr.opaque(mi.UInt32, most)
-    active &= depth < limit
-    while active:
-        value, si = seen(ray, sampler, depth, depth + 1 >= limit, active)
-        total += dr.select(active, throughput * value, 0)
-        active &= si.is_valid()
-        valid |= active
-        bsdf = si.bsdf()
-        active &= _scatters_into_single_directions(bsdf)
-        sample, weight = bsdf.sample(
-            context, si, sampler.next_1d(active), mi.Point2f(sampler.next_2d(active)), active
-        )
-        throughput *= weight
-        ray = si.spawn_ray(si.to_world(sample.wo))
-        depth += 1
-        active &= (depth < limit) & (dr.max(throughput) > 0)
-    return total, valid
-
-
-def _scatters_into_single_directions(bsdf: mi.BSDFPtr) -> mi.Mask:
-    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # Null is among them
 
 
 def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
@@ -217,7 +184,8 @@ class GlossyRelitScene(RelitScene):
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients(environment), transport.reflection
         assert isinstance(surfaces, InOutFactors)
-        super().__init__(scene, found.unit_albedo, background, max_depth=transport.max_depth)
+        followed = surfaces_to_follow(scene, surfaces)
+        super().__init__(scene, found.unit_albedo, background, None, transport.max_depth, followed)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
@@ -349,7 +317,8 @@ def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> R
         return GlossyRelitScene(scene, transport, environment, background)
     dark = transport.measurement.kind != "vertices"
     irradiance = np.zeros((scene.n_vertices, 3), np.float32) if dark else transport.irradiance(environment)
-    return RelitScene(scene, irradiance, background, lamps, transport.max_depth)
+    followed = () if dark or lamps is not None else surfaces_to_follow(scene, transport.reflection)
+    return RelitScene(scene, irradiance, background, lamps, transport.max_depth, followed)
 
 
 def _rendered(

@@ -7,12 +7,8 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mi_sparse_prt.relighting.image import (
-    MOST_MIRRORS,
-    RelitIntegrator,
-    RelitScene,
-    follow_single_directions,
-)
+from mi_sparse_prt.relighting.followed_rays import Seen, Way, follow, is_one_of
+from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 from mi_sparse_prt.solvers.paths import has_mirrors
 
@@ -27,7 +23,7 @@ class LampLitIntegrator(RelitIntegrator):
     Parameters
     ----------
     relit : sequence of RelitScene
-        All other light; what they show is added up.
+        All other light, that of lamps last; what they show is added up.
     scene : mi.Scene
         The shapes and the lamps, and maybe an environment, which is left out.
     max_depth : int
@@ -39,8 +35,8 @@ class LampLitIntegrator(RelitIntegrator):
         self._more = relit[1:]
         self._scene = scene if scene.environment() is None else without_environment(scene)
         self._direct = mi.load_dict({"type": "path", "max_depth": 2})
-        self._goes_on = has_mirrors(scene)
-        self._most = max_depth if 0 <= max_depth < MOST_MIRRORS else MOST_MIRRORS
+        self._followed, self._max_depth = relit[-1].followed, max_depth
+        self._goes_on = has_mirrors(scene) or bool(self._followed)
 
     def sample(
         self,
@@ -54,23 +50,18 @@ class LampLitIntegrator(RelitIntegrator):
         for relit in self._more:
             value += relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))[0]
         if self._goes_on:
-            direct, _ = follow_single_directions(
-                self._seen, mi.Ray3f(ray), sampler, mi.Mask(active), self._most
-            )
+            direct, _ = follow(self._seen, mi.Ray3f(ray), sampler, mi.Mask(active), self._max_depth)
         else:
             direct, _, _ = self._direct.sample(self._scene, sampler, ray, medium, active)
         return value + direct, valid, others
 
-    def _seen(
-        self, ray: mi.Ray3f, sampler: mi.Sampler, depth: mi.UInt32, last: mi.Mask, active: mi.Mask
-    ) -> tuple[mi.Color3f, mi.SurfaceInteraction3f]:
-        """See ``follow_single_directions``; a lamp seen in a mirror is among the mirror's direct light."""
-        si = self._scene.ray_intersect(ray, active)
-        direct, _, _ = self._direct.sample(
-            self._scene, sampler, mi.RayDifferential3f(ray), None, active & ~last
-        )
-        before = active & ~last & (depth > 0)
-        return direct - dr.select(before, si.emitter(self._scene, before).eval(si, before), 0), si
+    def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
+        """See ``follow``; a lamp seen in a mirror is among the mirror's direct light."""
+        si, reflects = self._scene.ray_intersect(ray, active), active & ~way.last
+        direct, _, _ = self._direct.sample(self._scene, sampler, mi.RayDifferential3f(ray), None, reflects)
+        before = reflects & (way.depth > 0)
+        direct -= dr.select(before, si.emitter(self._scene, before).eval(si, before), 0)
+        return Seen(direct, si, is_one_of(self._followed, si))
 
 
 def without_environment(scene: mi.Scene) -> mi.Scene:

@@ -54,6 +54,8 @@ class Material:
         It reflects diffusely and does nothing else.
     glossy : bool
         It scatters some light into a range of directions, and not alike into all.
+    known_by_irradiance : bool
+        What it reflects follows from its irradiance, but for single directions.
     bends_normals : bool
         A bump or normal map turns its shading normals.
     two_sided : bool
@@ -100,6 +102,8 @@ class Material:
         self.bends_normals = bool(self._classes & BUMPED)
         self.diffuse = self._lambertian and not self.bends_normals
         self.glossy = bool(flags & int(mi.BSDFFlags.Glossy))
+        spread = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
+        self.known_by_irradiance = not (flags & int(spread) or self.bends_normals)
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))

@@ -1,0 +1,150 @@
+"""Rays of a camera that go on from the surfaces that they meet, by Mitsuba's own samples of what these scatter.
+
+Mirrors, glass and masks scatter into single directions: of these, rays follow one. Glossy surfaces that no in-out
+factors stand for (narrow lobes, BSDFs that vary over the surface, bent normals, rough glass) are followed as a whole:
+one random direction, and light of the environment by a shadow ray as well, weighted as in Mitsuba's ``path``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.reflection.reflection import Reflection
+from mi_sparse_prt.scene.scene import Scene
+
+LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
+
+
+class Way(NamedTuple):
+    """How a ray came to be.
+
+    Attributes
+    ----------
+    depth : UInt32
+        Surfaces that it met before.
+    last : Mask
+        None may reflect after these.
+    density : Float
+        With which its direction was chosen, per solid angle; 0 if it could be no other.
+    """
+
+    depth: Any
+    last: Any
+    density: Any
+
+
+class Seen(NamedTuple):
+    """What a ray meets.
+
+    Attributes
+    ----------
+    radiance : Color3f
+        But for what a surface scatters into directions that are followed.
+    si : SurfaceInteraction3f
+    whole : Mask
+        All that the surface scatters is followed, not only single directions.
+    """
+
+    radiance: Any
+    si: Any
+    whole: Any
+
+
+def surfaces_to_follow(scene: Scene, reflection: Reflection | None = None) -> list[mi.BSDF]:
+    """BSDFs of which no row tells what they reflect: neither diffuse, nor factored, nor of single directions alone."""
+    found: list[mi.BSDF] = []
+    for mesh, material in zip(scene.meshes, scene.materials, strict=True):
+        factored = isinstance(reflection, InOutFactors) and reflection.material[mesh.vertices.start] >= 0
+        front = scene.materials[mesh.shape].bsdf
+        if not (material.known_by_irradiance or factored or any(front is bsdf for bsdf in found)):
+            found.append(front)
+    return found
+
+
+def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
+    """Whether the surface that was met has one of some BSDFs."""
+    result, own = mi.Mask(False), si.bsdf()
+    for bsdf in bsdfs:
+        result |= own == mi.BSDFPtr(bsdf)
+    return result
+
+
+@dr.syntax
+def follow(
+    seen: Callable[[mi.Ray3f, Way, mi.Sampler, mi.Mask], Seen],
+    ray: mi.Ray3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
+    max_depth: int,
+) -> tuple[mi.Color3f, mi.Mask]:
+    """The radiance of what rays see that go on from surfaces, and whether they meet any.
+
+    Parameters
+    ----------
+    seen : callable
+    ray : Ray3f, world
+    sampler : Sampler
+    active : Mask
+    max_depth : int
+        Surfaces and the light after them, as for ``path``.
+    """
+    ray, active = mi.Ray3f(ray), mi.Mask(active)
+    total, throughput, density = mi.Color3f(0), mi.Color3f(1), mi.Float(0)
+    depth, valid = mi.UInt32(0), mi.Mask(False)
+    limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
+    active &= depth < limit
+    while active:
+        radiance, si, whole = seen(ray, Way(depth, depth + 1 >= limit, density), sampler, active)
+        total += dr.select(active, throughput * radiance, 0)
+        active &= si.is_valid()
+        valid |= active
+        sample, weight = _scattered(si, whole, sampler, active)
+        density = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, sample.pdf)
+        throughput *= weight
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        depth += 1
+        active &= (depth < limit) & (dr.max(throughput) > 0)
+    return total, valid
+
+
+def _scattered(
+    si: mi.SurfaceInteraction3f, whole: mi.Mask, sampler: mi.Sampler, active: mi.Mask
+) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+    """A direction that rays go on in, and what it weighs: 0 where there is none."""
+    bsdf, u, v = si.bsdf(), sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
+    single = mi.BSDFContext()
+    single.type_mask = int(mi.BSDFFlags.Delta)  # Null is among them
+    alone = active & ~whole & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+    sample, weight = bsdf.sample(single, si, u, v, alone)
+    weight = dr.select(alone, weight, 0)
+    if not (whole.state == dr.VarState.Literal and dr.none(whole)):
+        every, its = bsdf.sample(mi.BSDFContext(), si, u, v, active & whole)
+        sample, weight = dr.select(whole, every, sample), dr.select(active & whole, its, weight)
+    return sample, weight
+
+
+def background_light(background: mi.Emitter, ray: mi.Ray3f, way: Way, active: mi.Mask) -> mi.Color3f:
+    """What rays see that leave the scene; a share of it where shadow rays see the same (multiple importance)."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = -ray.d
+    there = dr.zeros(mi.DirectionSample3f)
+    there.d = ray.d
+    other = background.pdf_direction(si, there, active)
+    share = dr.select(way.density > 0, way.density / (way.density + other), 1)
+    return dr.select(active, background.eval(si, active) * share, 0)
+
+
+def reflected_background(
+    background: mi.Emitter, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Mask
+) -> mi.Color3f:
+    """Light of the environment that surfaces reflect, by a shadow ray; the rest of it is found by following them."""
+    there, light = background.sample_direction(si, mi.Point2f(sampler.next_2d(active)), active)
+    active &= (there.pdf > 0) & ~scene.ray_test(si.spawn_ray(there.d), active)
+    value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(there.d), active)
+    share = dr.select(there.delta, 1, there.pdf / (there.pdf + density))
+    return dr.select(active, value * light * share, 0)
