@@ -27,7 +27,9 @@ from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
 from mi_sparse_prt.scene.materials import Material, bsdf_class
 from mi_sparse_prt.scene.scene import Scene
 
-TOO_NARROW = 0.1  # error of images from which factors are left out, and cameras follow rays: a diffuse surface has 1
+TOO_NARROW = (
+    0.1  # error of images from which factors are left out, and cameras follow rays: a diffuse surface has 1
+)
 NO_TANGENTS = (
     "shape '{}': its BSDF is anisotropic and it has no texture coordinates: Mitsuba then takes the first edge of each "
     "triangle for its tangent, which vertices cannot follow; give it texture coordinates"

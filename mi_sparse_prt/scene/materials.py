@@ -98,7 +98,7 @@ class Material:
         # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
         self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
         flags = int(bsdf.flags())
-        self._lambertian = flags & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.DiffuseReflection)
+        self._lambertian = _lambertian(bsdf)
         self.bends_normals = bool(self._classes & BUMPED)
         self.diffuse = self._lambertian and not self.bends_normals
         self.glossy = bool(flags & int(mi.BSDFFlags.Glossy))
@@ -137,6 +137,7 @@ class Material:
     def albedo(self, shape: mi.Mesh, mesh: TriangleMesh) -> NDArray[np.float32]:
         """(n, 3) reflectance at the vertices of `mesh`, evaluated by Mitsuba on its twin `shape`.
 
+        Of a mask, that of what it covers: vertices know nothing of the holes between them.
         Each vertex is looked at in the corner of one of its triangles, from the direction of its normal.
         """
         n = len(mesh.positions)
@@ -156,7 +157,12 @@ class Material:
         si = shape.compute_surface_interaction(ray, pi)
         si.t = mi.Float(1.0)
         si.wi = mi.Vector3f(0, 0, self._side)
-        value = self.bsdf.eval_diffuse_reflectance(si) if self._lambertian else self._directional_albedo(si)
+        covered = _covered(self.bsdf)
+        value = (
+            covered.eval_diffuse_reflectance(si)
+            if _lambertian(covered)
+            else self._directional_albedo(covered, si)
+        )
         albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
         bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
         if bad.size:
@@ -166,7 +172,7 @@ class Material:
             )
         return np.ascontiguousarray(np.minimum(albedo, 1))
 
-    def _directional_albedo(self, si: mi.SurfaceInteraction3f) -> mi.Color3f:
+    def _directional_albedo(self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> mi.Color3f:
         """The share of light from the normal's direction that is reflected, but for mirrors: a mean of samples."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
@@ -176,7 +182,7 @@ class Material:
             lobe, x, y = _radical_inverse(k) + 0.5 / (n * n), (k % n + 0.5) / n, (k // n + 0.5) / n
             lobe, x, y = (dr.opaque(mi.Float, value) for value in (lobe, x, y))  # one kernel for all strata
             u = mi.Point2f(x, y)
-            sample, weight = self.bsdf.sample(context, si, lobe, u)
+            sample, weight = bsdf.sample(context, si, lobe, u)
             single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
             total += dr.select((sample.wo.z * self._side > 0) & ~single, mi.Color3f(weight), 0)
             dr.eval(total)
@@ -226,6 +232,16 @@ def _reflects_behind(flags: int) -> bool:
     """Whether a component of a BSDF, by its flags, reflects on its back, by more than a mirror's single direction."""
     wide = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection
     return bool(flags & int(wide)) and bool(flags & int(mi.BSDFFlags.BackSide))
+
+
+def _lambertian(bsdf: mi.BSDF) -> bool:
+    """Whether it reflects diffusely, and does nothing else, by what it says of itself."""
+    return int(bsdf.flags()) & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.DiffuseReflection)
+
+
+def _covered(bsdf: mi.BSDF) -> mi.BSDF:
+    """What a mask covers; any other BSDF itself."""
+    return dict(children(bsdf))["nested_bsdf"] if bsdf.class_name() == "MaskBSDF" else bsdf
 
 
 def _lookup(texture: mi.Texture, data: mi.TensorXf, to_uv: mi.ScalarTransform3f) -> tuple[str, str]:

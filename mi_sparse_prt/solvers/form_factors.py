@@ -72,7 +72,7 @@ class Surfaces:
     """The triangles of a scene on the device, by the numbers of all vertices."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene.normalised
+        self._scene, self._passes_straight = scene.normalised, scene.passes_straight
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self._first_triangle = first_triangles(self._scene)
         self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
@@ -89,11 +89,19 @@ class Surfaces:
 
     def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
         """A vertex or NOTHING for every ray; u in [0, 1) chooses among the corners of a triangle."""
-        return self.corner(self._scene.ray_intersect_preliminary(ray), ray.d, u)
+        return self.corner(self._scene.ray_intersect_preliminary(ray), ray, u)
 
-    def corner(self, hit: mi.PreliminaryIntersection3f, direction: mi.Vector3f, u: mi.Float) -> mi.UInt32:
-        """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING."""
+    def corner(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
+        """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING.
+
+        Also NOTHING with the probability of light to go straight on: rows of masks are those of what they cover.
+        """
         valid = hit.is_valid()
+        if self._passes_straight:
+            si = hit.compute_surface_interaction(ray, active=valid)
+            passed = dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, valid)))
+            valid &= u >= passed
+            u = (u - passed) / dr.maximum(1 - passed, 1e-6)
         first = self._first_triangle.gather(hit.shape, valid)
         corners = [
             dr.gather(mi.UInt32, self._triangles, 3 * (first + hit.prim_index) + k, valid) for k in range(3)
@@ -104,7 +112,7 @@ class Surfaces:
         for corner, weight in zip(corners, weights, strict=True):
             normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
         chosen = dr.select(u < b[0], corners[1], dr.select(u < b[0] + b[1], corners[2], corners[0]))
-        front = dr.dot(normal, direction) < 0  # of the shading normal, as for Mitsuba's BSDFs
+        front = dr.dot(normal, ray.d) < 0  # of the shading normal, as for Mitsuba's BSDFs
         chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._backs, chosen, valid & ~front))
         return dr.select(valid, chosen, NOTHING)
 

@@ -229,7 +229,7 @@ class SpecularRays:
                 texel = texel_at(*face_coordinates(ray.d), self._resolution)
                 column = dr.select(valid | straight, NOTHING, texel)
             else:
-                column = dr.select(valid, self._surfaces.corner(hit, ray.d, rng.next_float32()), NOTHING)
+                column = dr.select(valid, self._surfaces.corner(hit, ray, rng.next_float32()), NOTHING)
             ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
             alive = goes_on & valid & (dr.max(weight) > 0)
             dr.eval(row, column, weight, ends, alive, ray, rng, straight, hit)

@@ -91,6 +91,37 @@ def test_gathered_light_is_that_of_paths():
         assert (np.abs(ours - theirs) < 4 * error + 0.02 * theirs.mean()).all()
 
 
+def test_cut_outs_send_on_what_they_do_not_let_by():
+    """Expected: cards with holes, of which all corners or none are holes, reflect by the share that is not.
+
+    Means over meshes under all light are those of paths within 2%; they were 30 to 60% off when a hit on a card counted
+    as one on the whole of it, and leaves whose corners are transparent were black.
+    """
+    grey = diffuse(0.6, 0.6, 0.6)
+    shapes: dict = {"floor": {**FLOOR, "bsdf": grey}}
+    for k in range(4):
+        holes = {**CHECKERS, "to_uv": T().scale(4), "color0": k % 2, "color1": 1 - k % 2}
+        shapes[f"card{k}"] = {
+            "type": "rectangle",
+            "to_world": T().translate([0.6 * k - 0.9, 0.6, 0.2 * k]).rotate([0, 1, 0], 30 * k).scale(0.5),
+            "bsdf": {"type": "mask", "opacity": holes, "bsdf": twosided(grey)},
+        }
+    scene, lighting = build(0.15, **shapes), prt.CubemapLighting(1)
+    problem = replace(problem_at(scene, lighting, basis="texel", max_depth=-1), specular_apart=True)
+    place = np.repeat(np.arange(scene.n_vertices), 6), np.tile(np.arange(6), scene.n_vertices)
+    seen = DirectSolver(problem, 4).elements(*place).reshape(-1, 6)
+    bounced = RadiositySolver(problem, 1024).apply(seen).mean(axis=2).sum(axis=1)
+    paths = (
+        PathSolver(problem, 256).rows(np.arange(scene.n_vertices)).mean.mean(axis=2) @ lighting.solid_angles
+    )
+    assert [mesh.name for mesh in scene.meshes[5:]] == [f"card{k}_back" for k in range(4)]
+    for mesh in scene.meshes:
+        ours, known = bounced[mesh.vertices].mean(), paths[mesh.vertices].mean()
+        print(f"{mesh.name}: {ours:.4f}, by paths {known:.4f}")
+        assert scene.albedo[mesh.vertices] == pytest.approx(0.6)
+        assert ours == pytest.approx(known, rel=0.02)
+
+
 def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
     scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
@@ -131,8 +162,7 @@ def test_pixels_see_by_way_of_mirrors_and_glass():
     The mean over all pixels differs by less than 1% (3 seeds: 0.2 to 0.3%). Paths that count light again which passed
     straight through surfaces find 6% more, and gathering without what arrives by mirrors and glass 11% less.
     """
-    shapes = {name: shape for name, shape in objects(0.6).items() if name != "cut"}
-    scene, lighting = build(0.2, **shapes), prt.CubemapLighting(4)
+    scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
     camera = mi.load_dict(
         {
             "type": "perspective",
