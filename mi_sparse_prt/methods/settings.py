@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from mi_sparse_prt.core.errors import PrtError
@@ -109,7 +110,9 @@ class Settings:
     @property
     def specular(self) -> SpecularOptions:
         """How light that arrives by way of mirrors and glass is looked for."""
-        return SpecularOptions(error=(self.target_error or TARGET) / 1.5)
+        return SpecularOptions(
+            error=(self.target_error or TARGET) / math.sqrt(2)
+        )  # half of the squared error
 
     @property
     def view_dependent(self) -> bool:

@@ -112,8 +112,8 @@ class _Choice:
     def factors(self, material: Material, names: list[str]) -> BrdfFactors | None:
         """Of a surface that is glossy and can be factored."""
         shapes, kind = _listed(names), bsdf_class(material.bsdf)
-        if not material.glossy and not material.bends_normals:
-            return None  # all that is not diffuse goes into single directions
+        if material.rough_glass or not material.glossy and not material.bends_normals:
+            return None  # rays go on there
         if material.bends_normals:
             self._left.append(f"{shapes} ({kind} bends the shading normals)")
             return None

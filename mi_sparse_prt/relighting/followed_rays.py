@@ -7,7 +7,7 @@ one random direction, and light of the environment by a shadow ray as well, weig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -64,14 +64,6 @@ def surfaces_to_follow(scene: Scene, reflection: Reflection | None = None) -> li
         if not (material.known_by_irradiance or factored or any(front is bsdf for bsdf in found)):
             found.append(front)
     return found
-
-
-def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
-    """Whether the surface that was met has one of some BSDFs."""
-    result, own = mi.Mask(False), si.bsdf()
-    for bsdf in bsdfs:
-        result |= own == mi.BSDFPtr(bsdf)
-    return result
 
 
 @dr.syntax

@@ -28,10 +28,10 @@ from mi_sparse_prt.relighting.followed_rays import (
     Way,
     background_light,
     follow,
-    is_one_of,
     reflected_background,
     surfaces_to_follow,
 )
+from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
 from mi_sparse_prt.transport import LightTransport

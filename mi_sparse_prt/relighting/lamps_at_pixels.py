@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mi_sparse_prt.relighting.followed_rays import Seen, Way, follow, is_one_of
+from mi_sparse_prt.relighting.followed_rays import Seen, Way, follow
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
+from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 from mi_sparse_prt.solvers.paths import has_mirrors
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from copy import copy
 from typing import Any
 
@@ -42,6 +43,14 @@ def printed(thing: mi.Object) -> str:
     return re.sub(r" at 0x[0-9a-f]+", "", str(thing))
 
 
+def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
+    """Whether the surfaces that were met have one of some BSDFs."""
+    result, own = mi.Mask(False), si.bsdf()
+    for bsdf in bsdfs:
+        result |= own == mi.BSDFPtr(bsdf)
+    return result
+
+
 class Material:
     """A shape's BSDF, and what can be said about it.
 
@@ -64,6 +73,8 @@ class Material:
         Some light goes through it.
     single_directions : bool
         It scatters some light into single directions: a mirror, glass, a mask.
+    rough_glass : bool
+        Light goes through it into a range of directions. It keeps none: rays go on, as from mirrors.
     passes_straight : bool
         Some of it goes straight on, as if nothing were there.
     constant : bool
@@ -106,6 +117,7 @@ class Material:
         self.known_by_irradiance = not (flags & int(spread) or self.bends_normals)
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
+        self.rough_glass = bool(flags & int(mi.BSDFFlags.GlossyTransmission))
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
         textured = self._radiance is not None and self._radiance.is_spatially_varying()
@@ -137,7 +149,7 @@ class Material:
     def albedo(self, shape: mi.Mesh, mesh: TriangleMesh) -> NDArray[np.float32]:
         """(n, 3) reflectance at the vertices of `mesh`, evaluated by Mitsuba on its twin `shape`.
 
-        Of a mask, that of what it covers: vertices know nothing of the holes between them.
+        Of a mask, that of what it covers: vertices know nothing of the holes between them. Of rough glass 0.
         Each vertex is looked at in the corner of one of its triangles, from the direction of its normal.
         """
         n = len(mesh.positions)
@@ -158,11 +170,12 @@ class Material:
         si.t = mi.Float(1.0)
         si.wi = mi.Vector3f(0, 0, self._side)
         covered = _covered(self.bsdf)
-        value = (
-            covered.eval_diffuse_reflectance(si)
-            if _lambertian(covered)
-            else self._directional_albedo(covered, si)
-        )
+        if self.rough_glass:
+            value = mi.Color3f(0)
+        elif _lambertian(covered):
+            value = covered.eval_diffuse_reflectance(si)
+        else:
+            value = self._directional_albedo(covered, si)
         albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
         bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
         if bad.size:

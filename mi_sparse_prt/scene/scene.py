@@ -235,8 +235,13 @@ class Scene:
 
     @property
     def specular(self) -> bool:
-        """Whether any surface scatters light into single directions: mirrors, glass, masks."""
-        return any(material.single_directions for material in self.materials)
+        """Whether light goes on from any surface as it came: mirrors, glass, rough glass, masks."""
+        return any(material.single_directions or material.rough_glass for material in self.materials)
+
+    @cached_property
+    def rough_glass(self) -> list[mi.BSDF]:
+        """BSDFs that let light through into a range of directions."""
+        return [material.bsdf for material in self.materials[: len(self.fronts)] if material.rough_glass]
 
     @property
     def passes_straight(self) -> bool:

@@ -69,11 +69,12 @@ def gather_matrix(
 
 
 class Surfaces:
-    """The triangles of a scene on the device, by the numbers of all vertices."""
+    """The triangles of a scene on the device, by the numbers of all vertices (``n_vertices``)."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._passes_straight = scene.normalised, scene.passes_straight
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
+        self.n_vertices = scene.n_vertices
         self._first_triangle = first_triangles(self._scene)
         self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
         self._normals = mi.Vector3f(scene.normals.T)

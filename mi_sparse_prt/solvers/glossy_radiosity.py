@@ -34,7 +34,7 @@ from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, cosine_
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements, Gathered
-from mi_sparse_prt.solvers.specular import specular_form_factors
+from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import contacts
 

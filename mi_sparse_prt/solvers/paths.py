@@ -7,7 +7,7 @@ interface. The estimates of different elements are independent, which later stat
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # paths per wavefront, about half a second each
@@ -175,9 +176,9 @@ class PathSolver:
             direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
             shadow = distant(direction, solid_angle / mean)
         light = Light(shadow)
-        if has_mirrors(self.scene):
+        if self.problem.scene.specular:
             inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
-            light = Light(shadow, inside, 1 / mean, apart)
+            light = Light(shadow, inside, 1 / mean, apart, self.problem.scene.rough_glass)
         return trace_reflected(self.scene, ray, light, rng, bounces)
 
 
@@ -195,13 +196,16 @@ class Light:
         that leave the scene right after one collect ``radiance`` if they leave towards the light.
     radiance : Float, optional
     scattered : bool
-        Only paths collect it that another surface has scattered on the way.
+        Only paths collect it that another surface has scattered on the way, and not by mirrors and glass alone.
+    rough_glass : sequence of mi.BSDF
+        These are glass as well, then.
     """
 
     sample: Callable[[Any, Any], tuple[Any, Any, Any]]
     contains: Callable[[mi.Vector3f], mi.Mask] | None = None
     radiance: mi.Float | None = None
     scattered: bool = False
+    rough_glass: Sequence[mi.BSDF] = ()
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
@@ -247,7 +251,8 @@ def trace_reflected(
             active,
         )
         # NaN is lit, so that it is noticed, and what factored BSDFs make negative
-        lit = active & ~dr.all(value == 0)
+        rough = is_one_of(light.rough_glass, si)
+        lit = active & ~dr.all(value == 0) & (counts | ~rough)
         shadow = si.spawn_ray(towards) if reach is None else si.spawn_ray_to(si.p + towards * reach)
         lit &= ~scene.ray_test(shadow, lit)
         result += dr.select(lit, throughput * value * irradiance, 0)
@@ -257,7 +262,7 @@ def trace_reflected(
         throughput *= weight
         ray = si.spawn_ray(si.to_world(sample.wo))
         mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        counts |= ~mirrored
+        counts |= ~mirrored & ~rough
         active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
         if light.contains is None:
             active &= depth < bounces

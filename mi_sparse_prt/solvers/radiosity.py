@@ -30,7 +30,7 @@ from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import specular_form_factors
+from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 

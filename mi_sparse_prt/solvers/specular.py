@@ -1,44 +1,31 @@
-"""Light that arrives by way of mirrors, glass and masks: rays go on until they meet no more of it.
+"""Light that arrives from the sky by way of mirrors, glass and masks.
 
-What scatters light into single directions keeps no rows: Mitsuba's own BSDF samples say where a ray goes on, and with
-which weight. Where it meets a surface that reflects diffusely as well, that is an entry of the form-factor matrix;
-where it leaves the scene, it is light of the texel that it leaves to. Light of the second kind is sharp and noisy: it
-is an operator of its own, with few elements, found by as many rays as its noise asks for.
-
-Light that goes straight through (masks, thin panes, ``null``) needs no random rays: see ``passed_light``.
+It is sharp and noisy: an operator of its own, with few elements, found by as many rays as its noise asks for. What
+goes straight through (masks, thin panes, ``null``) needs no random rays: see ``passed_light``.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.random_keys import element_seeds, random_generator, random_stream
-from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
-from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, SpecularChains
 
-LANES = 1 << 22  # rays per wavefront
-FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
-PARTS = 16  # of a hemisphere, per axis
 DIRECT = 1 / 3  # of the squared norm of light that nothing blocks: a guess of what direct light has
-MOST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 SPECULAR = 7  # spawn key
+ROUNDS = 3  # after the first rays
 
-Sparse: TypeAlias = scipy.sparse.csr_array
+Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -48,9 +35,9 @@ class SpecularOptions:
     Attributes
     ----------
     first : int
-        Strata per axis of a part of the hemisphere, each with a ray, in each of two independent halves.
+        Strata per axis of a cell of the hemisphere, each with a ray, in each of two independent halves.
     last : int
-        At most; there are more each time, until the noise is small enough.
+        At most; cells from which more light arrives have more, until the noise is small enough.
     error : float
         Noise that is small enough: relative L2, of direct and specular light together.
     strata : int
@@ -81,204 +68,23 @@ class SpecularLight(NamedTuple):
     rays: int
 
 
-class _Found(NamedTuple):
-    """Ends of rays: which row each belongs to, a column, and its weight per channel (n, 3)."""
+class _Limit(NamedTuple):
+    """What squared noise may be: a share of the squared norm of light, and a number."""
 
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-    weights: NDArray[np.float32]
+    share: float
+    number: float
 
-
-class _Ends(NamedTuple):
-    """Ends of rays on the device: rows, columns and weights, as far as they are valid."""
-
-    row: Any
-    column: Any
-    weight: Any
-    valid: Any
+    def of(self, square: float) -> float:
+        return self.share * square + self.number
 
 
-class SpecularRays:
-    """Rays from points that go on where they meet specular surfaces.
+class _Estimate(NamedTuple):
+    """Two halves, each of three channels; the squared norm of radiance, the squared noise of the mean, and rays."""
 
-    Parameters
-    ----------
-    problem : Problem
-        Light of a cubemap.
-    """
-
-    def __init__(self, problem: Problem) -> None:
-        self._scene, self._surfaces = problem.scene.normalised, Surfaces(problem.scene)
-        self._points = PointArrays(problem.points)
-        self._resolution, self._texels = problem.emission.resolution, problem.emission.size
-        self._most = most_on_the_way(problem.max_depth)
-
-    def parts_that_see(self, ids: Ids, seed: int) -> tuple[Ids, Ids]:
-        """Parts of the hemispheres of points in which, or next to which, a ray meets a specular surface.
-
-        There are PARTS x PARTS of a hemisphere, all of the same cosine-weighted solid angle; a ray goes into each.
-
-        Returns
-        -------
-        rows, parts : (m,) int64
-            ``rows`` count ``ids``.
-        """
-        found = []
-        for a in range(0, len(ids), LANES // PARTS**2):
-            some = ids[a : a + LANES // PARTS**2]
-            rows, parts = (x.ravel() for x in np.indices((len(some), PARTS**2)))
-            ray, _, _ = self._rays(some, rows, parts, 1, seed)
-            seen = self._specular_hits(ray)[1].numpy().reshape(-1, PARTS, PARTS)
-            grown = scipy.ndimage.maximum_filter(seen, (1, 3, 3))
-            row, part = np.nonzero(grown.reshape(len(some), -1))
-            found.append((a + row, part))
-        rows, parts = (np.concatenate(x) for x in zip(*found, strict=True))
-        return rows, parts
-
-    def sky(self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int) -> NDArray[np.float32]:
-        """Light of texels to which rays from points leave the scene, but for those that went straight all the way.
-
-        Parameters
-        ----------
-        ids : (n,) integers
-            Points.
-        rows, parts : (m,) int64
-            Of ``parts_that_see``.
-        strata : int
-            Per axis of a part, each with a ray.
-        seed : int
-
-        Returns
-        -------
-        (3, n, n_directions) float32
-            Unit-albedo transport.
-        """
-        ray, row, rng = self._rays(ids, rows, parts, strata, seed)
-        size = len(ids) * self._texels
-        sums = [dr.zeros(mi.UInt32, size) for _ in range(3)]
-        scale = FIXED_POINT / (PARTS * strata) ** 2  # whole numbers: sums do not depend on the order of rays
-        for ends in self._walked(ray, row, rng, True):
-            place = ends.row * self._texels + ends.column
-            for c, total in enumerate(sums):
-                share = mi.UInt32(ends.weight[c] * dr.opaque(mi.Float, scale) + 0.5)
-                dr.scatter_reduce(dr.ReduceOp.Add, total, share, place, ends.valid)
-        shape = len(ids), self._texels
-        return np.stack([(total.numpy() / np.float32(FIXED_POINT)).reshape(shape) for total in sums])
-
-    def surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> _Found:
-        """Vertices of the surfaces that cosine-distributed rays from some points meet after specular ones."""
-        ray, point, _ = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
-        lane = dr.arange(mi.UInt32, len(ids) * len(samples[0]))
-        row = lane // len(samples[0])
-        rng = random_generator(self._points.key(point), lane - row * len(samples[0]), mi.UInt32(1), seed)
-        found = []
-        for depth, ends in enumerate(self._walked(ray, row, rng, False), 1):
-            if depth < self._most:  # light of a surface at the end makes one more bounce
-                kept = ends.valid.numpy()
-                arrays = ends.row.numpy(), ends.column.numpy(), ends.weight.numpy().T
-                found.append(_Found(*(x[kept] for x in arrays)))
-        rows, columns, weights = _joined(found)
-        return _Found(rows, columns, weights / np.float32(len(samples[0])))
-
-    def _rays(
-        self, ids: Ids, rows: Ids, parts: Ids, strata: int, seed: int
-    ) -> tuple[mi.Ray3f, mi.UInt32, mi.PCG32]:
-        """Rays into parts of hemispheres, one in each stratum, their rows, and random numbers for the rest."""
-        lane = dr.arange(mi.UInt32, len(rows) * strata**2)
-        entry = lane // strata**2
-        stratum = lane - entry * strata**2
-        row, part = (dr.gather(mi.UInt32, mi.UInt32(x.astype(np.uint32)), entry) for x in (rows, parts))
-        point = dr.gather(mi.UInt32, mi.UInt32(ids.astype(np.uint32)), row)
-        rng = random_generator(self._points.key(point), part, stratum, seed)
-        fine = PARTS * strata
-        x = mi.Float((part % PARTS) * strata + stratum % strata) + rng.next_float32()
-        y = mi.Float((part // PARTS) * strata + stratum // strata) + rng.next_float32()
-        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x / fine, y / fine))
-        direction = mi.Frame3f(self._points.normal(point)).to_world(local)
-        return start_ray(self._points, point, direction), row, rng
-
-    def _specular_hits(self, ray: mi.Ray3f) -> tuple[mi.PreliminaryIntersection3f, mi.Mask]:
-        """What rays meet, and whether that scatters light into single directions."""
-        hit = self._scene.ray_intersect_preliminary(ray)
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
-        return hit, hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
-
-    def _walked(self, ray: mi.Ray3f, row: mi.UInt32, rng: mi.PCG32, to_sky: bool) -> Iterator[_Ends]:
-        """Rays that end after one specular surface, after two, ...: at texels of the sky, or at vertices."""
-        context = mi.BSDFContext()
-        context.type_mask = int(mi.BSDFFlags.Delta)
-        hit, met = self._specular_hits(ray)
-        dr.eval(hit, met, ray, row, rng)
-        index = dr.compress(met)  # few of them
-        ray, row, rng, hit = (dr.gather(type(x), x, index) for x in (ray, row, rng, hit))
-        weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
-        for _ in range(self._most):
-            if len(index) == 0:
-                return
-            si = hit.compute_surface_interaction(ray, active=hit.is_valid())
-            goes_on = hit.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)
-            goes_on &= dr.max(weight) > 0
-            u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-            scattered, share = si.bsdf().sample(context, si, *u, goes_on)
-            weight = dr.select(goes_on, weight * share, 0)
-            straight &= mi.has_flag(scattered.sampled_type, mi.BSDFFlags.Null)
-            ray = si.spawn_ray(si.to_world(scattered.wo))
-            hit = self._scene.ray_intersect_preliminary(ray, active=goes_on)
-            valid = hit.is_valid()
-            if to_sky:
-                texel = texel_at(*face_coordinates(ray.d), self._resolution)
-                column = dr.select(valid | straight, NOTHING, texel)
-            else:
-                column = dr.select(valid, self._surfaces.corner(hit, ray, rng.next_float32()), NOTHING)
-            ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
-            alive = goes_on & valid & (dr.max(weight) > 0)
-            dr.eval(row, column, weight, ends, alive, ray, rng, straight, hit)
-            yield _Ends(row, column, weight, ends)
-            index = dr.compress(alive)
-            row, weight, straight, ray, rng, hit = (
-                dr.gather(type(x), x, index) for x in (row, weight, straight, ray, rng, hit)
-            )
-
-
-def most_on_the_way(max_depth: int) -> int:
-    """How many specular surfaces a ray may meet that then leaves the scene."""
-    return MOST if max_depth < 0 else min(max_depth - 2, MOST)
-
-
-def _joined(parts: list[_Found]) -> _Found:
-    if not parts:
-        none = np.zeros(0, np.int64)
-        return _Found(none, none, np.zeros((0, 3), np.float32))
-    return _Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
-
-
-def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> Sparse:
-    """What G (n, n_v) lacks without specular surfaces: what rays from some points find after these.
-
-    Parameters
-    ----------
-    problem : Problem
-    ids : (n,) integers
-        Points.
-    rays : int
-        From each, a power of two.
-    seed : int
-
-    Notes
-    -----
-    Weights of colours are averaged. A surface that is found after k specular ones sends out light of as many bounces as
-    any other, k more than Mitsuba's ``path`` would follow at the same depth.
-    """
-    walks, samples = SpecularRays(problem), sobol(rays)
-    step = max(1, LANES // rays)
-    shape = (0, problem.scene.n_vertices)
-    blocks = [scipy.sparse.csr_array(shape, dtype=np.float32)]
-    for a in range(0, len(ids), step):
-        part = ids[a : a + step]
-        rows, columns, weights = walks.surfaces(part, samples, seed)
-        entries = weights.mean(axis=1), (rows, columns)
-        blocks.append(scipy.sparse.coo_array(entries, shape=(len(part), shape[1])).tocsr())
-    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
+    halves: list[list[Sparse]]
+    square: float
+    noise: float
+    rays: int
 
 
 def specular_light(
@@ -289,8 +95,8 @@ def specular_light(
 ) -> SpecularLight:
     """Light from the sky that arrives by way of mirrors and glass, at some points.
 
-    A few rays tell in which parts of its hemisphere a point sees specular surfaces; those are sampled, ever finer,
-    until the noise is small enough. What is smaller than a part, and met by no ray, is not found.
+    A few rays tell in which cells of its hemisphere a point sees specular surfaces; those are sampled, finer where more
+    light arrives, until the noise is small enough. What is smaller than a cell, and met by no ray, is not found.
 
     Parameters
     ----------
@@ -301,115 +107,140 @@ def specular_light(
         Points; all if not given.
     """
     every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
-    walks, albedo = SpecularRays(problem), problem.reflection.albedo[every]
-    seeds = iter(element_seeds(random_stream(seed, SPECULAR), 64))
-    rows, parts = walks.parts_that_see(every, next(seeds))
-    enough = options.error**2 / 2, options.error**2 / 2 * DIRECT * _unblocked(problem, albedo)
-
-    def arriving(strata: int) -> list[list[Sparse]]:
-        where = rows, parts
-        return [_sampled(walks, every, where, strata, next(seeds), problem.emission.size) for _ in "ab"]
-
-    def passing(strata: int) -> list[list[Sparse]]:
-        return [[half] * 3 for half in _passed_twice(problem, every, strata, next(seeds), next(seeds))]
-
-    found = [
-        _refined(passing, options.strata, albedo, enough),
-        _refined(arriving, options.first, albedo, enough, options.last),
-    ]
-    traced = len(every) * PARTS**2 + 2 * len(rows) * sum(s**2 for s in found[1].strata)
-    mean = [
-        (a + b + c + d) * np.float32(0.5)
-        for (a, b), (c, d) in zip(*(zip(*part.halves, strict=True) for part in found), strict=True)
-    ]
+    seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 64)]
+    power = np.square(problem.reflection.albedo[every].astype(np.float64))
+    parts = 2 if problem.scene.passes_straight else 1
+    share = options.error**2 / parts
+    limit = _Limit(share, share * DIRECT * _unblocked(problem, power))
+    found = [_Arriving(problem, every, power, seeds).refined(options, limit)]
+    if problem.scene.passes_straight:
+        found.append(_passing(problem, every, power, seeds, options, limit))
+    halves = [half for estimate in found for half in estimate.halves]
+    mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
     operator = SparseRows(tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean)))
-    square, noise = (sum(x) for x in zip(*((part.square, part.noise) for part in found), strict=True))
-    return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), traced)
+    square, noise = sum(part.square for part in found), sum(part.noise for part in found)
+    rays = sum(part.rays for part in found)
+    return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), rays)
 
 
-class _Refined(NamedTuple):
-    """Two halves, each of three channels; the squared norms of radiance and noise, and the strata that were tried."""
+class _Arriving:
+    """Light that arrives around corners: by mirrors and glass."""
 
-    halves: list[list[Sparse]]
-    square: float
-    noise: float
-    strata: list[int]
+    def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
+        self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
+        self._size = problem.emission.size
+        self._cells = self._chains.find_cells(ids, next(self._seeds))
+
+    def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
+        """As many strata as the noise asks for.
+
+        The first rays, as many into each cell, say where light comes from; they are not among those that are kept then,
+        so that a cell of which they happened to find much light counts no more than another.
+        """
+        strata = np.full(len(self._cells.rows), options.first)
+        found, squares = self._sampled(strata)
+        rays = len(self._ids) * CELLS**2 + found.rays
+        if found.noise <= limit.of(found.square) or options.first >= options.last:
+            return found._replace(rays=rays)
+        n = 2 * options.first**2
+        second = (squares + squares.mean() / n) / (
+            n + 1
+        )  # moments of weights, as if there were one average ray more
+        best = np.sqrt(
+            second * self._power.max(axis=1)[self._cells.rows]
+        )  # numbers of rays are proportional to it
+        noise_of_one = found.noise * (n / 2) * best.sum() / (best**2).sum()
+        wanted = 0.9 * max(limit.of(found.square), 1e-30)
+        for _ in range(ROUNDS):
+            strata = np.clip(np.rint(np.sqrt(best * (noise_of_one / wanted))), 1, options.last).astype(
+                np.int64
+            )
+            found, _ = self._sampled(strata)
+            rays += found.rays
+            if found.noise <= limit.of(found.square) or strata.min() == options.last:
+                break
+            wanted /= max(found.noise / max(limit.of(found.square), 1e-30), 1.2)
+        return found._replace(rays=rays)
+
+    def _sampled(self, strata: NDArray[np.int64]) -> tuple[_Estimate, NDArray[np.float64]]:
+        """Light from rays into cells, twice; and the squared weights of rays of each cell, summed."""
+        halves, squares = [], np.zeros(len(strata))
+        for _ in "ab":
+            half, found = self._light(strata, next(self._seeds))
+            halves.append(half)
+            squares += found
+        return _compared(halves, self._power, 2 * int((strata**2).sum())), squares
+
+    def _light(self, strata: NDArray[np.int64], seed: int) -> tuple[list[Sparse], NDArray[np.float32]]:
+        """Light (points, texels) of each channel, for some points at a time."""
+        none = scipy.sparse.csr_array((len(self._ids), self._size), dtype=np.float32)
+        lit, starts = np.unique(self._cells.rows, return_index=True)  # rows are sorted
+        starts = np.append(starts, len(strata))
+        rays = np.concatenate([[0], np.cumsum(strata**2)])[starts]
+        found, squares, first = [], [np.zeros(0, np.float32)], 0
+        while first < len(lit):
+            most = int(np.searchsorted(rays, rays[first] + LANES, side="right")) - 1
+            last = min(max(most, first + 1), first + max(1, LANES // self._size), len(lit))
+            part = slice(starts[first], starts[last])
+            here, some = self._ids[lit[first:last]], self._cells.take(part)
+            some = some._replace(rows=np.searchsorted(lit[first:last], some.rows))
+            sky = self._chains.gather_sky(here, some, strata[part], seed)
+            found.append([scipy.sparse.csr_array(channel) for channel in sky.light])
+            squares.append(sky.squares)
+            first = last
+        channels = [scipy.sparse.vstack(blocks, format="csr") for blocks in zip(*found, strict=True)]
+        return [_spread(m, lit, none.shape) for m in channels] or [none] * 3, np.concatenate(squares)
 
 
-def _refined(
-    sample: Callable[[int], list[list[Sparse]]],
-    first: int,
-    albedo: NDArray[np.float32],
-    enough: tuple[float, float],
-    last: int = 8,
-) -> _Refined:
-    """Sample with more strata each time, until squared noise is below a factor times the squared norm, and a number."""
-    tried = [first]
-    while True:
-        halves = sample(tried[-1])
-        square, noise = _compared(halves, albedo)
-        limit = enough[0] * square + enough[1]
-        if noise <= limit or tried[-1] >= last:
-            return _Refined(halves, square, noise, tried)
-        # between 1 / strata, as of rays at random, and its square, as of smooth light
-        wanted = tried[-1] * (noise / max(limit, 1e-30)) ** (0.5 / 1.25)
-        tried.append(min(last, max(tried[-1] + 1, math.ceil(min(wanted, 3 * tried[-1])))))
+def _spread(matrix: Sparse, rows: Ids, shape: tuple[int, int]) -> Sparse:
+    """A matrix with more rows, of which some are those of another."""
+    counts = np.zeros(shape[0], np.int64)
+    counts[rows] = np.diff(matrix.indptr)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return scipy.sparse.csr_array((matrix.data, matrix.indices, starts), shape=shape)
 
 
-def _passed_twice(problem: Problem, ids: Ids, strata: int, *seeds: int) -> list[Sparse]:
-    """``passed_light``, independently where it is random; nothing where nothing lets light pass."""
-    if not problem.scene.passes_straight:
-        return [scipy.sparse.csr_array((len(ids), problem.emission.size), dtype=np.float32)] * 2
-    if problem.basis == "direction":
-        return [passed_light(DirectSolver(problem), ids)] * 2
-    return [passed_light(DirectSolver(problem, strata, seed), ids) for seed in seeds]
+def _passing(
+    problem: Problem, ids: Ids, power: Doubles, seeds: list[int], options: SpecularOptions, limit: _Limit
+) -> _Estimate:
+    """Light that goes straight through surfaces that take a part of it, twice where it is random."""
+
+    def sampled(strata: int) -> _Estimate:
+        if problem.basis == "direction":
+            halves = [[passed_light(DirectSolver(problem), ids)] * 3] * 2
+        else:
+            solvers = (DirectSolver(problem, strata, seed) for seed in seeds[-2:])
+            halves = [[passed_light(solver, ids)] * 3 for solver in solvers]
+        return _compared(halves, power, 0)
+
+    return _refined(sampled, options.strata, limit)
 
 
-def _sampled(
-    walks: SpecularRays, points: Ids, where: tuple[Ids, Ids], strata: int, seed: int, size: int
-) -> list[Sparse]:
-    """Light (points, size) of each channel, from rays into parts of hemispheres."""
-    lit, starts = np.unique(where[0], return_index=True)  # rows are sorted
-    ends = np.append(starts[1:], len(where[0]))
-    found: list[list[Sparse]] = [[], [], []]
-    first = 0
-    while first < len(lit):
-        room = LANES // strata**2 + starts[first], first + max(1, LANES // size)
-        last = max(first + 1, min(int(np.searchsorted(ends, room[0], side="right")), room[1]))
-        some = slice(starts[first], ends[last - 1])
-        rows = np.searchsorted(lit[first:last], where[0][some])
-        dense = walks.sky(points[lit[first:last]], rows, where[1][some], strata, seed)
-        for channel, part in zip(found, dense, strict=True):
-            channel.append(scipy.sparse.csr_array(part))
-        first = last
-    counts = np.zeros(len(points), np.int64)
-    none = scipy.sparse.csr_array((len(points), size), dtype=np.float32)
-    result = []
-    for channel in found if len(lit) else []:
-        together = scipy.sparse.vstack(channel, format="csr")
-        counts[lit] = np.diff(together.indptr)
-        starts_of_rows = np.concatenate([[0], np.cumsum(counts)])
-        result.append(
-            scipy.sparse.csr_array((together.data, together.indices, starts_of_rows), shape=none.shape)
-        )
-    return result or [none] * 3
+def _refined(sample: Callable[[int], _Estimate], strata: int, limit: _Limit, last: int = 8) -> _Estimate:
+    """Sample with more strata each time, until the noise is small enough."""
+    found = sample(strata)
+    while found.noise > limit.of(found.square) and strata < last:
+        # squared noise of strata falls as strata**-3 at the edges of light, of which there are as many as strata
+        factor = (found.noise / max(limit.of(found.square), 1e-30)) ** (1 / 3)
+        strata = min(last, max(strata + 1, int(np.ceil(strata * min(factor, 3)))))
+        found = sample(strata)
+    return found
 
 
-def _compared(halves: list[list[Sparse]], albedo: NDArray[np.float32]) -> tuple[float, float]:
-    """Squared norm of radiance, and of the noise in the mean of the two halves."""
+def _compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> _Estimate:
+    """With the squared norm of radiance, and of the noise in the mean of the two halves."""
     square, noise = 0.0, 0.0
     for c, (a, b) in enumerate(zip(*halves, strict=True)):
-        power = np.square(albedo[:, c].astype(np.float64))
-        square += float(power @ (a.multiply(b)).sum(axis=1))
-        noise += float(power @ ((a - b).power(2)).sum(axis=1)) / 4
-    return max(square, 0.0), noise
+        square += float(power[:, c] @ (a.multiply(b)).sum(axis=1))
+        noise += float(power[:, c] @ ((a - b).power(2)).sum(axis=1)) / 4
+    return _Estimate(halves, max(square, 0.0), noise, rays)
 
 
-def _unblocked(problem: Problem, albedo: NDArray[np.float32]) -> float:
+def _unblocked(problem: Problem, power: Doubles) -> float:
     """Squared norm of radiance under light that nothing blocks: the mean square of a cosine is a sixth."""
     weights = float(np.square(problem.emission.solid_angles.astype(np.float64) / np.pi).sum())
-    return weights / 6 * float(np.square(albedo.astype(np.float64)).sum())
+    return weights / 6 * float(power.sum())
 
 
 def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:

@@ -18,16 +18,10 @@ from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import (
-    LANES,
-    PARTS,
-    SPECULAR,
-    SpecularLight,
-    SpecularRays,
-    passed_light,
-)
+from mi_sparse_prt.solvers.specular import SPECULAR, SpecularLight, passed_light
+from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, SpecularChains
 
-STRATA = 4  # per axis of a part of a hemisphere, each with a ray
+STRATA = 4  # per axis of a cell of a hemisphere, each with a ray
 
 Floats = NDArray[np.float32]
 Sparse: TypeAlias = scipy.sparse.csr_array
@@ -60,10 +54,10 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     assert isinstance(reflection, InOutFactors)
     ids, lobes = reflection.glossy, Lobes(reflection)
     bent_seed, straight_seed = element_seeds(random_stream(seed, SPECULAR, 1), 2)
-    walks = _TermWalks(problem)
+    chains = _TermChains(problem)
     shape = len(ids) * reflection.terms, problem.emission.size
     sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
-    parts = [walks.bent(ids, lobes, bent_seed)]
+    parts = [chains.bent(ids, lobes, bent_seed)]
     if problem.scene.passes_straight:
         parts.append(_straight(problem, ids, lobes, straight_seed))
     for part in parts:
@@ -74,10 +68,10 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
         scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
         for c, terms in enumerate(sums)
     )
-    return SpecularLight(SparseRows(matrices), specular.noise, specular.rays + walks.traced)
+    return SpecularLight(SparseRows(matrices), specular.noise, specular.rays + chains.traced)
 
 
-class _TermWalks(SpecularRays):
+class _TermChains(SpecularChains):
     """Rays that remember in which direction they left their points."""
 
     def __init__(self, problem: Problem) -> None:
@@ -86,20 +80,21 @@ class _TermWalks(SpecularRays):
 
     def bent(self, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
         """Light that points receive by way of mirrors and glass, for some rays at a time."""
-        rows, parts = self.parts_that_see(ids, seed)
-        self.traced += len(ids) * PARTS**2 + len(rows) * STRATA**2
+        cells = self.find_cells(ids, seed)
+        self.traced += len(ids) * CELLS**2 + len(cells.rows) * STRATA**2
         step = max(1, LANES // (STRATA**2 * 8))
-        for a in range(0, len(rows), step):
-            some = slice(a, a + step)
-            ray, row, rng = self._rays(ids, rows[some], parts[some], STRATA, seed)
-            point = dr.gather(mi.UInt32, mi.UInt32(np.asarray(ids).astype(np.uint32)), row)
-            into, of_lane = _weights(lobes, point, ray.d), row.numpy().astype(np.int64)
-            for ends in self._walked(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True):
+        for a in range(0, len(cells.rows), step):
+            some = cells.take(slice(a, a + step))
+            ray, entry, rng = self._rays_into(ids, some, np.full(len(some.rows), STRATA), seed)
+            of_lane = some.rows[entry.numpy()]
+            point = mi.UInt32(np.asarray(ids)[of_lane].astype(np.uint32))
+            into = _weights(lobes, point, ray.d)
+            for ends in self._follow(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True):
                 kept = ends.valid.numpy()
                 lanes, texels, light = (
-                    x[kept] for x in (ends.row.numpy(), ends.column.numpy(), ends.weight.numpy().T)
+                    x[kept] for x in (ends.of.numpy(), ends.column.numpy(), ends.weight.numpy().T)
                 )
-                share = light / np.float32((PARTS * STRATA) ** 2)
+                share = light / np.float32((CELLS * STRATA) ** 2)
                 yield _Light(of_lane[lanes], texels.astype(np.int64), into[lanes], share)
 
 

@@ -1,0 +1,267 @@
+"""Rays that go on from one specular surface to the next: mirrors, glass, masks.
+
+What scatters light into single directions keeps no rows, and rough glass none either: Mitsuba's own BSDF samples say
+where a ray goes on, and with which weight. Where it meets a surface that reflects diffusely, that is an entry of the
+form-factor matrix; where it leaves the scene, it is light of the texel that it leaves to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
+from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.scene.materials import is_one_of
+from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.solvers.problem import Problem
+
+LANES = 1 << 22  # rays per wavefront
+FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
+CELLS = 16  # of a hemisphere, per axis
+LONGEST = 16  # surfaces on the way, where ``max_depth`` sets no limit
+
+Sparse: TypeAlias = scipy.sparse.csr_array
+
+
+class Cells(NamedTuple):
+    """Cells of the hemispheres of some points, of the same cosine-weighted solid angle, CELLS x CELLS of each.
+
+    Attributes
+    ----------
+    rows : (m,) int64
+        Which of the points, ascending.
+    numbers : (m,) int64
+        Of a cell of its hemisphere.
+    """
+
+    rows: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+
+    def take(self, part: slice) -> Cells:
+        """Some of them."""
+        return Cells(self.rows[part], self.numbers[part])
+
+
+class SkyLight(NamedTuple):
+    """What rays into cells found.
+
+    Attributes
+    ----------
+    light : (3, n, n_directions) float32
+        Unit-albedo transport of points.
+    squares : (m,) float32
+        Of the weights of rays that left the scene, summed over those of each cell.
+    """
+
+    light: NDArray[np.float32]
+    squares: NDArray[np.float32]
+
+
+class _Ends(NamedTuple):
+    """Ends of rays on the device: the number that each was given, a column, its weight, and whether it is valid."""
+
+    of: Any
+    column: Any
+    weight: Any
+    valid: Any
+
+
+class SpecularChains:
+    """Rays from points that go on where they meet specular surfaces.
+
+    Parameters
+    ----------
+    problem : Problem
+        Light of a cubemap.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._scene, self._surfaces = problem.scene.normalised, Surfaces(problem.scene)
+        self._rough_glass = problem.scene.rough_glass
+        self._points = PointArrays(problem.points)
+        self._resolution, self._texels = problem.emission.resolution, problem.emission.size
+        depth = problem.max_depth
+        self._longest = LONGEST if depth < 0 else min(depth - 2, LONGEST)
+
+    def find_cells(self, ids: Ids, seed: int) -> Cells:
+        """Cells of the hemispheres of points in which, or next to which, a ray meets a specular surface."""
+        found = []
+        for a in range(0, len(ids), LANES // CELLS**2):
+            some = ids[a : a + LANES // CELLS**2]
+            cells = Cells(*(x.ravel() for x in np.indices((len(some), CELLS**2))))
+            ray, _, _ = self._rays_into(some, cells, np.ones(len(cells.rows), np.int64), seed)
+            seen = self._specular_hits(ray)[1].numpy().reshape(-1, CELLS, CELLS)
+            grown = scipy.ndimage.maximum_filter(seen, (1, 3, 3))
+            row, number = np.nonzero(grown.reshape(len(some), -1))
+            found.append((a + row, number))
+        return Cells(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+    def gather_sky(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> SkyLight:
+        """Light of texels to which rays from points leave the scene, but for those that went straight all the way.
+
+        Parameters
+        ----------
+        ids : (n,) integers
+            Points.
+        cells : Cells
+            (m,) of these.
+        strata : (m,) int64
+            Per axis of each cell, each with a ray.
+        seed : int
+        """
+        ray, entry, rng = self._rays_into(ids, cells, strata, seed)
+        rows, scale = (
+            mi.UInt32(cells.rows.astype(np.uint32)),
+            FIXED_POINT / (CELLS * strata.astype(float)) ** 2,
+        )
+        scales = mi.Float(scale.astype(np.float32))
+        sums = [dr.zeros(mi.UInt32, len(ids) * self._texels) for _ in range(3)]
+        squares = dr.zeros(mi.UInt32, len(strata))
+        # whole numbers: sums do not depend on the order of rays
+        for ends in self._follow(ray, entry, rng, True):
+            place = dr.gather(mi.UInt32, rows, ends.of) * self._texels + ends.column
+            unit = dr.gather(mi.Float, scales, ends.of)
+            for c, total in enumerate(sums):
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add, total, mi.UInt32(ends.weight[c] * unit + 0.5), place, ends.valid
+                )
+            square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
+            dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid)
+        dr.eval(*sums, squares)
+        shape = len(ids), self._texels
+        light = np.stack([(total.numpy() / np.float32(FIXED_POINT)).reshape(shape) for total in sums])
+        return SkyLight(light, squares.numpy() / np.float32(2**16))
+
+    def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> Sparse:
+        """What cosine-distributed rays from some points find after specular surfaces, by vertices (n, n_v).
+
+        Weights of colours are averaged.
+        """
+        n, rays = len(ids), len(samples[0])
+        ray, point, _ = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
+        lane = dr.arange(mi.UInt32, n * rays)
+        row = lane // rays
+        rng = random_generator(self._points.key(point), lane - row * rays, mi.UInt32(1), seed)
+        entries: list[tuple[NDArray[Any], ...]] = [(np.zeros(0, np.float32), *(np.zeros(0, np.uint32),) * 2)]
+        for depth, ends in enumerate(self._follow(ray, row, rng, False), 1):
+            if depth < self._longest:  # light of a surface at the end makes one more bounce
+                kept = ends.valid.numpy()
+                weight = ends.weight.numpy().mean(axis=0)
+                entries.append((weight[kept], ends.of.numpy()[kept], ends.column.numpy()[kept]))
+        weights, rows, columns = (np.concatenate(x) for x in zip(*entries, strict=True))
+        shape = n, self._surfaces.n_vertices
+        return scipy.sparse.coo_array((weights / np.float32(rays), (rows, columns)), shape=shape).tocsr()
+
+    def _rays_into(
+        self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int
+    ) -> tuple[mi.Ray3f, mi.UInt32, mi.PCG32]:
+        """Rays into cells, one in each stratum, the cells that they belong to, and random numbers for the rest."""
+        counts = strata**2
+        of_lane = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+        first = (np.cumsum(counts) - counts).astype(np.uint32)
+        entry = mi.UInt32(of_lane)
+        row, cell, across, start = (
+            dr.gather(mi.UInt32, mi.UInt32(x.astype(np.uint32)), entry)
+            for x in (cells.rows, cells.numbers, strata, first)
+        )
+        stratum = dr.arange(mi.UInt32, len(of_lane)) - start
+        point = dr.gather(mi.UInt32, mi.UInt32(ids.astype(np.uint32)), row)
+        rng = random_generator(self._points.key(point), cell, stratum, seed)
+        across = dr.maximum(across, 1)  # 0 in lanes beyond the last one, by which processors do not divide
+        down = stratum // across
+        x, y = (
+            (mi.Float(c * across + k) + rng.next_float32()) / mi.Float(CELLS * across)
+            for c, k in ((cell % CELLS, stratum - down * across), (cell // CELLS, down))
+        )
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
+        direction = mi.Frame3f(self._points.normal(point)).to_world(local)
+        return start_ray(self._points, point, direction), entry, rng
+
+    def _specular_hits(self, ray: mi.Ray3f) -> tuple[mi.PreliminaryIntersection3f, mi.Mask]:
+        """What rays meet, and whether they go on from there."""
+        hit = self._scene.ray_intersect_preliminary(ray)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
+        return hit, hit.is_valid() & self._is_specular(si)
+
+    def _is_specular(self, si: mi.SurfaceInteraction3f) -> mi.Mask:
+        return mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) | is_one_of(self._rough_glass, si)
+
+    def _follow(self, ray: mi.Ray3f, of: mi.UInt32, rng: mi.PCG32, to_sky: bool) -> Iterator[_Ends]:
+        """Rays that end after one specular surface, after two, ...: at texels of the sky, or at vertices."""
+        hit, met = self._specular_hits(ray)
+        dr.eval(hit, met, ray, of, rng)
+        index = dr.compress(met)  # few of them
+        ray, of, rng, hit = (dr.gather(type(x), x, index) for x in (ray, of, rng, hit))
+        weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
+        for _ in range(self._longest):
+            if len(index) == 0:
+                return
+            si = hit.compute_surface_interaction(ray, active=hit.is_valid())
+            goes_on = hit.is_valid() & self._is_specular(si) & (dr.max(weight) > 0)
+            scattered, share = self._scattered(si, rng, goes_on)
+            weight = dr.select(goes_on, weight * share, 0)
+            straight &= mi.has_flag(scattered.sampled_type, mi.BSDFFlags.Null)
+            ray = si.spawn_ray(si.to_world(scattered.wo))
+            hit = self._scene.ray_intersect_preliminary(ray, active=goes_on)
+            valid = hit.is_valid()
+            if to_sky:
+                texel = texel_at(*face_coordinates(ray.d), self._resolution)
+                column = dr.select(valid | straight, NOTHING, texel)
+            else:
+                column = dr.select(valid, self._surfaces.corner(hit, ray, rng.next_float32()), NOTHING)
+            ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
+            alive = goes_on & valid & (dr.max(weight) > 0)
+            dr.eval(of, column, weight, ends, alive, ray, rng, straight, hit)
+            yield _Ends(of, column, weight, ends)
+            index = dr.compress(alive)
+            of, weight, straight, ray, rng, hit = (
+                dr.gather(type(x), x, index) for x in (of, weight, straight, ray, rng, hit)
+            )
+
+    def _scattered(
+        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
+    ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+        """Where rays go on, and what that weighs: single directions, but all that rough glass scatters."""
+        u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        single = mi.BSDFContext()
+        single.type_mask = int(mi.BSDFFlags.Delta)
+        if not self._rough_glass:
+            return si.bsdf().sample(single, si, u, v, active)
+        rough = is_one_of(self._rough_glass, si)
+        sample, weight = si.bsdf().sample(single, si, u, v, active & ~rough)
+        every, its = si.bsdf().sample(mi.BSDFContext(), si, u, v, active & rough)
+        return dr.select(rough, every, sample), dr.select(rough, its, weight)
+
+
+def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> Sparse:
+    """What G (n, n_v) lacks without specular surfaces: what rays from some points find after these.
+
+    Parameters
+    ----------
+    problem : Problem
+    ids : (n,) integers
+        Points.
+    rays : int
+        From each, a power of two.
+    seed : int
+
+    Notes
+    -----
+    A surface that is found after k specular ones sends out light of as many bounces as any other, k more than
+    Mitsuba's ``path`` would follow at the same depth.
+    """
+    chains, samples = SpecularChains(problem), sobol(rays)
+    step = max(1, LANES // rays)
+    blocks = [scipy.sparse.csr_array((0, problem.scene.n_vertices), dtype=np.float32)]
+    blocks += [chains.gather_surfaces(ids[a : a + step], samples, seed) for a in range(0, len(ids), step)]
+    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
