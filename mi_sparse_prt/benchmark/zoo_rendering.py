@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import signal
 import tempfile
 import threading
@@ -91,7 +92,7 @@ def render_reference(path: Path, effort: ZooEffort, **parameters: Any) -> Pair:
     halves = [np.zeros(1, np.float32), np.zeros(1, np.float32)]
     for done in range(effort.passes):
         for k, half in enumerate(halves):
-            fresh = path_image(scene, scene.sensors()[0], MAX_DEPTH, effort.pass_spp, SEEDS * k + done)
+            fresh = path_image(scene, scene.sensors()[0], _depth(scene), effort.pass_spp, SEEDS * k + done)
             halves[k] = half + (fresh - half) / np.float32(done + 1)
         first, second = halves
         if relative_l2_without_noise((first + second) / 2, first, second)[1] <= effort.noise:
@@ -109,7 +110,7 @@ def render_matrix(path: Path, effort: ZooEffort, **parameters: Any) -> Rendering
                 "type": "sparse_prt",
                 "resolution": effort.resolution,
                 "target_error": effort.target_error,
-                "max_depth": MAX_DEPTH,
+                "max_depth": _depth(scene),
                 "cache": folder,
                 "progress": False,
             }
@@ -122,6 +123,13 @@ def render_matrix(path: Path, effort: ZooEffort, **parameters: Any) -> Rendering
     estimates = [matrix.report["estimated_error"]["total"] for matrix in matrices]
     said = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, PrtWarning))
     return Rendering((first, second), seconds, max(estimates, default=None), list(said))
+
+
+def _depth(scene: mi.Scene) -> int:
+    """``max_depth`` of the scene's own integrator; of one that has none, or no limit, that of all benchmarks."""
+    found = re.search(r"max_depth = (\d+)", str(scene.integrator()))
+    depth = int(found[1]) if found else MAX_DEPTH
+    return depth if depth < 1 << 31 else MAX_DEPTH
 
 
 def _picture(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> Image:

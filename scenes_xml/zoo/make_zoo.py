@@ -26,10 +26,14 @@ LEFT_OUT = {
     "blender": "is made from Blender's memory, not from a file",
 }
 
+#: BSDFs that light crosses more than once: of these there is a scene of its own with as many bounces as they need.
+CROSSED = ("dielectric", "roughdielectric", "principled_glass", "null", "hair")
+DEPTH, DEEP = 5, 16
+
 STAGE = """<!-- {title}. Written by make_zoo.py. -->
 <scene version="3.0.0">
     <default name="integrator" value="path"/>
-    <default name="max_depth" value="5"/>
+    <default name="max_depth" value="{depth}"/>
     <default name="width" value="96"/>
     <default name="height" value="72"/>
     <default name="spp" value="64"/>
@@ -481,15 +485,18 @@ def scenes() -> dict[str, str]:
     found: dict[str, str] = {}
     for kind, every in (("bsdf", BSDFS), ("shape", SHAPES), ("texture", TEXTURES)):
         found |= {f"{kind}_{name}": whole(kind, name, f"{SKY}\n{content}") for name, content in every.items()}
+    for name in CROSSED:
+        found[f"bsdf_{name}_deep"] = whole("bsdf", f"{name}_deep", f"{SKY}\n{BSDFS[name]}", DEEP)
     for name, content in EMITTERS.items():
         stands = "" if name == "area_mesh" else "\n" + BALL
         found[f"emitter_{name}"] = whole("emitter", name, content + stands)
     return found
 
 
-def whole(kind: str, name: str, content: str) -> str:
-    """The stage with what it is for."""
-    return STAGE.format(title=f"{kind}: {name.replace('_', ', ', 1)}", content=indented(content))
+def whole(kind: str, name: str, content: str, depth: int = DEPTH) -> str:
+    """The stage with what it is for, and the ``max_depth`` of its integrator."""
+    title = f"{kind}: {name.replace('_', ', ', 1)}"
+    return STAGE.format(title=title, content=indented(content), depth=depth)
 
 
 def main() -> None:
