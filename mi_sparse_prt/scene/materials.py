@@ -75,6 +75,8 @@ class Material:
         It scatters some light into single directions: a mirror, glass, a mask.
     rough_glass : bool
         Light goes through it into a range of directions. It keeps none: rays go on, as from mirrors.
+    bends_light : bool
+        It sends light on in other single directions, or is rough glass.
     passes_straight : bool
         Some of it goes straight on, as if nothing were there.
     constant : bool
@@ -118,6 +120,8 @@ class Material:
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.rough_glass = bool(flags & int(mi.BSDFFlags.GlossyTransmission))
+        bent = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
+        self.bends_light = self.rough_glass or bool(flags & int(bent))
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
         textured = self._radiance is not None and self._radiance.is_spatially_varying()

@@ -238,6 +238,11 @@ class Scene:
         """Whether light goes on from any surface as it came: mirrors, glass, rough glass, masks."""
         return any(material.single_directions or material.rough_glass for material in self.materials)
 
+    @property
+    def bends_light(self) -> bool:
+        """Whether light goes on from any surface in another direction: mirrors, glass, rough glass."""
+        return any(material.bends_light for material in self.materials)
+
     @cached_property
     def rough_glass(self) -> list[mi.BSDF]:
         """BSDFs that let light through into a range of directions."""

@@ -145,30 +145,38 @@ class DirectSolver:
         cosine = dr.dot(self._points.normal(point), direction)
         active &= cosine > 0
         ray = start_ray(self._points, point, direction)
-        blocked = self.scene.ray_test(ray, active=active)
         if self.problem.specular_apart and self.problem.scene.passes_straight:
-            blocked &= self._transmittance(ray, active & blocked) < ALL
-        return active & ~blocked, cosine
+            return active & (self._transmittance(ray, active) >= ALL), cosine
+        return active & ~self.scene.ray_test(ray, active=active), cosine
 
-    def passed(self, point_ids: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Unit-albedo transport (n, n_directions) of what surfaces let a part through of, and not all."""
-        ids = mi.UInt32(np.append(point_ids, point_ids[-1:]).astype(np.uint32))
-        element, stratum = self._lanes(len(point_ids) * self._n_texels)
-        row = element // self._n_texels
-        texel = element - row * self._n_texels
-        point = dr.gather(mi.UInt32, ids, row)
-        if self.basis == "direction":
-            direction, area, total = self._texels.centre(texel), mi.Float(1), mi.Float(1)
-        else:
-            direction, area, total = self._inside(point, texel, stratum, self.seed)
-        cosine = dr.dot(self._points.normal(point), direction)
-        ray = start_ray(self._points, point, direction)
-        blocked = self.scene.ray_test(ray, active=cosine > 0)
-        share = self._transmittance(ray, blocked)
-        value = dr.select(blocked & (share < ALL), share * cosine * area, 0)
-        mean = dr.block_reduce(dr.ReduceOp.Add, value, self.rays_per_element) / total
-        power = self.lighting.solid_angles / np.float32(np.pi)
-        return mean.numpy().reshape(-1, self._n_texels) * power
+    def partly_passed(
+        self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
+    ) -> NDArray[np.float32]:
+        """Unit-albedo transport of listed elements that surfaces let a part through of, and not all, (n,) float32.
+
+        Parameters
+        ----------
+        point_ids, texel_ids : (n,) integers
+        seed : int, optional
+            Texel basis: another seed gives an independent estimate.
+        """
+        result = np.zeros(len(point_ids), np.float32)
+        size = LANES // (4 * self.rays_per_element)
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            element, stratum = self._lanes(len(texels))
+            point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+            if self.basis == "direction":
+                direction, area, total = self._texels.centre(texel), mi.Float(1), mi.Float(1)
+            else:
+                own = self.seed if seed is None else seed
+                direction, area, total = self._inside(point, texel, stratum, own)
+            cosine = dr.dot(self._points.normal(point), direction)
+            share = self._transmittance(start_ray(self._points, point, direction), cosine > 0)
+            value = dr.select((cosine > 0) & (share < ALL), share * cosine * area, 0)
+            result[part] = (dr.block_reduce(dr.ReduceOp.Add, value, self.rays_per_element) / total).numpy()
+        return result * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
 
     @dr.syntax
     def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
@@ -181,10 +189,12 @@ class DirectSolver:
         share, count = mi.Float(1), mi.UInt32(0)
         ray, active = mi.Ray3f(ray), mi.Mask(active)
         while active:
-            si = self.scene.ray_intersect(ray, active)
-            active &= si.is_valid()
-            passed = mi.Color3f(si.bsdf().eval_null_transmission(si, active))
-            share = dr.select(active, dr.select(count < most, share * dr.mean(passed), 0), share)
+            hit = self.scene.ray_intersect_preliminary(ray, active=active)
+            active &= hit.is_valid()
+            through = active & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null) & (count < most)
+            si = hit.compute_surface_interaction(ray, active=through)
+            passed = dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
+            share = dr.select(active, dr.select(through, share * passed, 0), share)
             count += 1
             ray = si.spawn_ray(ray.d)
             active &= share > 0

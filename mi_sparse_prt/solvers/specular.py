@@ -24,6 +24,7 @@ from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, Specular
 DIRECT = 1 / 3  # of the squared norm of light that nothing blocks: a guess of what direct light has
 SPECULAR = 7  # spawn key
 ROUNDS = 3  # after the first rays
+FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 Doubles = NDArray[np.float64]
 
@@ -109,10 +110,12 @@ def specular_light(
     every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
     seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 64)]
     power = np.square(problem.reflection.albedo[every].astype(np.float64))
-    parts = 2 if problem.scene.passes_straight else 1
-    share = options.error**2 / parts
+    parts = int(problem.scene.bends_light) + int(problem.scene.passes_straight)
+    share = options.error**2 / max(parts, 1)
     limit = _Limit(share, share * DIRECT * _unblocked(problem, power))
-    found = [_Arriving(problem, every, power, seeds).refined(options, limit)]
+    found = []
+    if problem.scene.bends_light:
+        found.append(_Arriving(problem, every, power, seeds).refined(options, limit))
     if problem.scene.passes_straight:
         found.append(_passing(problem, every, power, seeds, options, limit))
     halves = [half for estimate in found for half in estimate.halves]
@@ -205,16 +208,35 @@ def _passing(
     problem: Problem, ids: Ids, power: Doubles, seeds: list[int], options: SpecularOptions, limit: _Limit
 ) -> _Estimate:
     """Light that goes straight through surfaces that take a part of it, twice where it is random."""
+    first = DirectSolver(problem, max(1, FINE // problem.emission.resolution), seeds[-3])
+    found, traced = passed_light(first, ids), len(ids) * problem.emission.size * first.rays_per_element
+    if problem.basis == "direction":
+        return _compared([[found] * 3] * 2, power, traced)
+    rows, texels = _with_neighbours(found, problem)
 
     def sampled(strata: int) -> _Estimate:
-        if problem.basis == "direction":
-            halves = [[passed_light(DirectSolver(problem), ids)] * 3] * 2
-        else:
-            solvers = (DirectSolver(problem, strata, seed) for seed in seeds[-2:])
-            halves = [[passed_light(solver, ids)] * 3 for solver in solvers]
-        return _compared(halves, power, 0)
+        nonlocal traced
+        solver, halves = DirectSolver(problem, strata), []
+        for seed in seeds[-2:]:
+            values = solver.partly_passed(ids[rows], texels, seed)
+            half = scipy.sparse.coo_array((values, (rows, texels)), shape=found.shape).tocsr()
+            half.eliminate_zeros()
+            halves.append([half] * 3)
+        traced += 2 * len(rows) * strata**2
+        return _compared(halves, power, traced)
 
     return _refined(sampled, options.strata, limit)
+
+
+def _with_neighbours(found: Sparse, problem: Problem) -> tuple[Ids, Ids]:
+    """Rows and columns of a matrix's elements, and of those that are beside these on the cubemap."""
+    beside = problem.emission.sides.tables.beside
+    texel = np.repeat(np.arange(len(beside)), beside.shape[1])
+    ones = np.ones(beside.size + len(beside), np.float32)
+    near = np.append(texel, np.arange(len(beside))), np.append(beside.ravel(), np.arange(len(beside)))
+    grown = scipy.sparse.csr_array(found @ scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2))
+    rows, texels = grown.tocoo().coords
+    return rows.astype(np.int64), texels.astype(np.int64)
 
 
 def _refined(sample: Callable[[int], _Estimate], strata: int, limit: _Limit, last: int = 8) -> _Estimate:
@@ -248,8 +270,10 @@ def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
 
     All of it, and nothing, is told by bits; here is what lies between.
     """
-    step = max(1, LANES // (direct.lighting.size * direct.rays_per_element))
-    blocks = [
-        scipy.sparse.csr_array(direct.passed(np.asarray(ids[a : a + step]))) for a in range(0, len(ids), step)
-    ]
-    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
+    size = direct.lighting.size
+    blocks = [scipy.sparse.csr_array((0, size), dtype=np.float32)]
+    for a in range(0, len(ids), max(1, LANES // size)):
+        some = np.asarray(ids[a : a + max(1, LANES // size)])
+        place = np.repeat(some, size), np.tile(np.arange(size), len(some))
+        blocks.append(scipy.sparse.csr_array(direct.partly_passed(*place).reshape(len(some), size)))
+    return scipy.sparse.vstack(blocks, format="csr")

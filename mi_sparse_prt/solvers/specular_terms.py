@@ -53,13 +53,13 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     reflection = problem.reflection
     assert isinstance(reflection, InOutFactors)
     ids, lobes = reflection.glossy, Lobes(reflection)
-    bent_seed, straight_seed = element_seeds(random_stream(seed, SPECULAR, 1), 2)
+    (bent_seed,) = element_seeds(random_stream(seed, SPECULAR, 1), 1)
     chains = _TermChains(problem)
     shape = len(ids) * reflection.terms, problem.emission.size
     sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
-    parts = [chains.bent(ids, lobes, bent_seed)]
+    parts = [chains.bent(ids, lobes, bent_seed)] if problem.scene.bends_light else []
     if problem.scene.passes_straight:
-        parts.append(_straight(problem, ids, lobes, straight_seed))
+        parts.append(_straight(problem, ids, lobes))
     for part in parts:
         for found in part:
             sums = [a + b for a, b in zip(sums, _rows_of_terms(found, shape), strict=True)]
@@ -98,16 +98,15 @@ class _TermChains(SpecularChains):
                 yield _Light(of_lane[lanes], texels.astype(np.int64), into[lanes], share)
 
 
-def _straight(problem: Problem, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
+def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[_Light]:
     """Light that comes straight through surfaces which let a part of it pass."""
-    direct = DirectSolver(problem, seed=seed)
-    step = max(1, LANES // (direct.lighting.size * direct.rays_per_element))
-    for a in range(0, len(ids), step):
-        found = passed_light(direct, ids[a : a + step]).tocoo()
-        rows, texels = found.coords[0] + a, found.coords[1]
+    found = passed_light(DirectSolver(problem), ids).tocoo()
+    step = LANES // 8
+    for a in range(0, found.nnz, step):
+        rows, texels = (x[a : a + step] for x in found.coords)
         point = mi.UInt32(np.asarray(ids)[rows].astype(np.uint32))
-        towards = mi.Vector3f(np.ascontiguousarray(direct.lighting.directions[texels].T))
-        light = np.repeat(found.data[:, None], 3, axis=1)
+        towards = mi.Vector3f(np.ascontiguousarray(problem.emission.directions[texels].T))
+        light = np.repeat(found.data[a : a + step, None], 3, axis=1)
         yield _Light(rows.astype(np.int64), texels.astype(np.int64), _weights(lobes, point, towards), light)
 
 
