@@ -113,7 +113,7 @@ def precompute(
         target. ``terms="auto"`` takes for each BRDF the fewest factors, 16 at most, that reflect light of an
         environment with half of the target error, and 0 where nothing is glossy. Mirrors, glass and masks have none:
         a camera's ray goes on there. What factors cannot stand for (BSDFs that vary over the surface in more than their
-        diffuse part, transmit, or have lobes narrower than factors can tell) is left as diffuse, and so are all
+        diffuse part, or have lobes narrower than factors can tell) is diffuse in the matrix, and so are all
         surfaces where the method, the basis or the measurement knows no terms; one warning names what is left.
     harmonics : int, optional
         Spherical harmonics up to this order instead of each BRDF's own incident factors: (order + 1)^2 terms, which

@@ -80,7 +80,7 @@ class SparsePRT(mi.SamplingIntegrator):
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               string or  In-out factors of each BSDF that is not diffuse, which is then shaded for the view,
                         integer    per pixel: ``auto`` (as many as the target error asks for, 16 at most), or a number;
-                                   with 0, all count as diffuse. (auto)
+                                   with 0, all count as diffuse. Rays go on from what has no factors. (auto)
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)

@@ -76,7 +76,8 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
     """What vertices do with incident light, with as many in-out factors as images need.
 
     Delta lobes have none: what a camera's ray sees by way of mirrors and glass, it sees by going on. Surfaces that
-    cannot be factored are left as diffuse. One warning names them, and those whose factors miss the bound.
+    cannot be factored are left as diffuse, and followed by cameras (``relighting.followed_rays``). One warning names
+    them, and those whose factors miss the bound.
 
     Parameters
     ----------
@@ -134,8 +135,8 @@ class _Choice:
         said = []
         if self._left:
             said.append(
-                f"glossy surfaces that factors cannot stand for are left as diffuse, which the estimated error does "
-                f"not know: {', '.join(self._left)}"
+                f"no factors stand for some glossy surfaces: cameras' rays go on there, to others they are as diffuse, "
+                f"which the estimated error does not know: {', '.join(self._left)}"
             )
         if self._off:
             said.append(

@@ -6,8 +6,10 @@ import pytest
 from conftest import GREY, T, build, diffuse, still_life
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene, background_emitter, render
 from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
+from mi_sparse_prt.scene.scene import Scene
 
 LIGHTING = prt.CubemapLighting(2)
 
@@ -188,6 +190,42 @@ def test_rows_are_put_into_the_scenes_order(scene, transport):
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def images_of_sky(scene: Scene, depth: int, of_path: bool, seeds: int = 8) -> np.ndarray:
+    """Images (seeds, height, width, 3) of a scene of black and followed surfaces under a coloured sky."""
+    texels = np.random.default_rng(3).uniform(0.2, 1, (24, 3)).astype(np.float32)
+    sky = background_emitter(texels, prt.CubemapLighting(2))
+    if of_path:
+        integrator, where = (
+            mi.load_dict({"type": "path", "max_depth": depth}),
+            lit_scene(scene.unlit_shapes(), sky),
+        )
+    else:
+        dark, followed = np.zeros((scene.n_vertices, 3), np.float32), surfaces_to_follow(scene)
+        integrator, where = (
+            RelitIntegrator(RelitScene(scene, dark, sky, None, depth, followed)),
+            scene.mitsuba,
+        )
+    runs = [
+        mi.render(where, sensor=scene.sensor(0), integrator=integrator, spp=256, seed=k) for k in range(seeds)
+    ]
+    return np.array([np.array(run)[..., :3] for run in runs], np.float64)
+
+
+def check_against_path(scene: Scene, depth: int) -> None:
+    """Each pixel within noise (Student's t of 8 runs each), and the mean within noise and 1%."""
+
+    def z(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / len(a))
+        return (a.mean(axis=0) - b.mean(axis=0)) / np.maximum(error, 1e-4 * b.mean())
+
+    ours, theirs = images_of_sky(scene, depth, False), images_of_sky(scene, depth, True)
+    every, total = z(ours, theirs), z(ours.mean(axis=(1, 2)), theirs.mean(axis=(1, 2)))
+    print(depth, np.abs(every).max(), total, ours.mean() / theirs.mean())
+    assert np.abs(every).max() < 8
+    assert np.abs(total).max() < 4.5
+    assert ours.mean() / theirs.mean() == pytest.approx(1, abs=0.01)
+
+
 def test_rays_go_on_through_mirrors_and_glass():
     """Rationale: nothing here is diffuse, so that a camera sees the sky alone, mirrored, refracted and let through.
 
@@ -208,37 +246,34 @@ def test_rays_go_on_through_mirrors_and_glass():
         air={"type": "cube", "to_world": T().translate([-1.5, 0, 2]).scale(0.4), "bsdf": {"type": "null"}},
         camera={"type": "perspective", "fov": 50, "to_world": view, "film": film},
     )  # fmt: skip
-    texels = np.random.default_rng(3).uniform(0.2, 1, (24, 3)).astype(np.float32)
-    sky = background_emitter(texels, prt.CubemapLighting(2))
-    irradiance = np.zeros((scene.n_vertices, 3), np.float32)
-
-    def images(depth: int, of_path: bool) -> np.ndarray:
-        """(runs, height, width, 3)"""
-        if of_path:
-            integrator, where = (
-                mi.load_dict({"type": "path", "max_depth": depth}),
-                lit_scene(scene.unlit_shapes(), sky),
-            )
-        else:
-            integrator, where = (
-                RelitIntegrator(RelitScene(scene, irradiance, sky, max_depth=depth)),
-                scene.mitsuba,
-            )
-        runs = [
-            mi.render(where, sensor=scene.sensor(0), integrator=integrator, spp=256, seed=k) for k in range(8)
-        ]
-        return np.array([np.array(run)[..., :3] for run in runs], np.float64)
-
-    def z(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / len(a))
-        return (a.mean(axis=0) - b.mean(axis=0)) / np.maximum(error, 1e-4 * b.mean())
-
     for depth in (1, 4, 7):
-        ours, theirs = images(depth, False), images(depth, True)
-        every = z(ours, theirs)
-        total = z(ours.mean(axis=(1, 2)), theirs.mean(axis=(1, 2)))
-        print(depth, np.abs(every).max(), total, ours.mean() / theirs.mean())
-        assert np.abs(every).max() < 8  # of 8 runs each: Student's t
-        assert np.abs(total).max() < 4.5
-        assert ours.mean() / theirs.mean() == pytest.approx(1, abs=0.01)
-    assert images(2, False).mean() < 0.98 * images(4, False).mean()
+        check_against_path(scene, depth)
+    assert images_of_sky(scene, 2, False).mean() < 0.98 * images_of_sky(scene, 4, False).mean()
+
+
+def test_glossy_surfaces_without_factors_are_followed():
+    """Expected: BSDFs that no factors stand for look as ``path`` shows them, and as it lights them by shadow rays.
+
+    Mirror-like and rough metal, rough glass, a blend and bent normals on four surfaces that see each other.
+    """
+    waves = mi.Bitmap((0.5 + 0.5 * np.sin(np.arange(32) / 3) * np.ones((32, 1))).astype(np.float32))
+    rough = {"type": "roughconductor", "material": "Au", "alpha": 0.3}
+    blend = {"type": "blendbsdf", "weight": 0.4, "first": rough, "second": {**rough, "alpha": 0.02}}
+    bent = {"type": "bumpmap", "arbitrary": {"type": "bitmap", "bitmap": waves, "raw": True}, "bsdf": rough}
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
+    view = T().look_at([0, 0.5, 6], [0, 0.3, 0], [0, 1, 0])
+    scene = build(
+        0.5,
+        glass={"type": "sphere", "radius": 0.8, "bsdf": {"type": "roughdielectric", "alpha": 0.2}},
+        gold={"type": "sphere", "center": [2, 0, 0], "bsdf": blend},
+        sharp={"type": "sphere", "center": [-2, 0, 0], "bsdf": {**rough, "alpha": 0.05}},
+        floor={
+            "type": "rectangle",
+            "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3),
+            "bsdf": bent,
+        },
+        camera={"type": "perspective", "fov": 50, "to_world": view, "film": film},
+    )
+    assert len(surfaces_to_follow(scene)) == 4
+    for depth in (2, 5):
+        check_against_path(scene, depth)
