@@ -176,7 +176,7 @@ class PathSolver:
             direction, solid_angle = self._texels.inside(texel, rng.next_float32(), rng.next_float32())
             shadow = distant(direction, solid_angle / mean)
         light = Light(shadow)
-        if self.problem.scene.specular:
+        if has_mirrors(self.scene) or apart:
             inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
             light = Light(shadow, inside, 1 / mean, apart, self.problem.scene.rough_glass)
         return trace_reflected(self.scene, ray, light, rng, bounces)
