@@ -148,9 +148,8 @@ class Execution:
         known = exact_direct(DirectSolver(replace(sources, basis="direction")), self._run)
         if not sources.specular_apart:
             return known
-        few = SpecularOptions(
-            last=4
-        )  # noise of single vertices: points see many, whose mean has little of it
+        # noise of single vertices does not matter: points see many, whose mean has little of it
+        few = SpecularOptions(last=4)
         return replace(known, specular=specular_light(sources, self._run.seed, few))
 
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:

@@ -110,9 +110,8 @@ class Settings:
     @property
     def specular(self) -> SpecularOptions:
         """How light that arrives by way of mirrors and glass is looked for."""
-        return SpecularOptions(
-            error=(self.target_error or TARGET) / math.sqrt(2)
-        )  # half of the squared error
+        half = (self.target_error or TARGET) / math.sqrt(2)  # of the squared error
+        return SpecularOptions(error=half)
 
     @property
     def view_dependent(self) -> bool:

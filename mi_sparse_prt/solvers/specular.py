@@ -147,18 +147,14 @@ class _Arriving:
         if found.noise <= limit.of(found.square) or options.first >= options.last:
             return found._replace(rays=rays)
         n = 2 * options.first**2
-        second = (squares + squares.mean() / n) / (
-            n + 1
-        )  # moments of weights, as if there were one average ray more
-        best = np.sqrt(
-            second * self._power.max(axis=1)[self._cells.rows]
-        )  # numbers of rays are proportional to it
+        # moments of weights, as if there were one average ray more; numbers of rays are proportional to their roots
+        second = (squares + squares.mean() / n) / (n + 1)
+        best = np.sqrt(second * self._power.max(axis=1)[self._cells.rows])
         noise_of_one = found.noise * (n / 2) * best.sum() / (best**2).sum()
         wanted = 0.9 * max(limit.of(found.square), 1e-30)
         for _ in range(ROUNDS):
-            strata = np.clip(np.rint(np.sqrt(best * (noise_of_one / wanted))), 1, options.last).astype(
-                np.int64
-            )
+            across = np.rint(np.sqrt(best * (noise_of_one / wanted)))
+            strata = np.clip(across, 1, options.last).astype(np.int64)
             found, _ = self._sampled(strata)
             rays += found.rays
             if found.noise <= limit.of(found.square) or strata.min() == options.last:
