@@ -24,9 +24,10 @@ from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.io.store import write_store
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.stored import operator_arrays
-from mi_sparse_prt.operators.sum import Sum
+from mi_sparse_prt.operators.sum import Sum, add
 from mi_sparse_prt.reflection.brdf_factors import harmonic_factors
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
@@ -199,6 +200,13 @@ class LightTransport:
         """What would leave points of albedo 1: irradiance / pi, (n, 3) float32 (see ``relight``)."""
         return self._incident_light(lighting)[: len(self.measurement)]
 
+    def irradiance_by_depth(self, lighting: Any) -> Floats:
+        """``irradiance`` of light that met at most 0, 1, ... surfaces: (k, n, 3) float32, all of it last.
+
+        Only that where light is not told apart by depth: k is 1.
+        """
+        return self._by_depth(lighting)[:, : len(self.measurement)]
+
     def relight(self, lighting: Any, outgoing: ArrayLike | None = None) -> Floats:
         """B = T L: light leaving the points under an environment.
 
@@ -223,10 +231,27 @@ class LightTransport:
 
     def coefficients(self, lighting: Any) -> Coefficients:
         """Irradiance / pi and terms of all points under an environment or L (n_directions, 3)."""
-        n, found = len(self.measurement), self._incident_light(lighting)
+        return self._coefficients(self._incident_light(lighting))
+
+    def coefficients_by_depth(self, lighting: Any) -> list[Coefficients]:
+        """``coefficients`` of light that met at most 0, 1, ... surfaces (``irradiance_by_depth``)."""
+        return [self._coefficients(found) for found in self._by_depth(lighting)]
+
+    def _coefficients(self, found: Floats) -> Coefficients:
+        """From the light (rows, 3) of all rows."""
+        n = len(self.measurement)
         terms = np.zeros((n, self.terms, 3), np.float32)
         terms[self.reflection.glossy] = found[n:].reshape(-1, self.terms, 3)
         return Coefficients(found[:n], terms)
+
+    def _by_depth(self, lighting: Any) -> Floats:
+        """Light (k, rows, 3) that met at most 0, 1, ... surfaces."""
+        known, found = self.emission.project(lighting), dict[int, list[Floats]]()
+        for operator in self.operators.values():
+            terms = enumerate(operator.terms, 1) if isinstance(operator, ByDepth) else [(0, operator)]
+            for depth, term in terms:
+                found.setdefault(depth, []).append(term.relight(known))
+        return np.cumsum([add(found[depth]) for depth in sorted(found)], axis=0)
 
     def _incident_light(self, lighting: Any) -> Floats:
         """Of all rows, (rows, 3)."""

@@ -29,7 +29,7 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.radiosity import Gathered, RadiositySolver
+from mi_sparse_prt.solvers.radiosity import Gathered, GatheredByDepth, RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularLight, SpecularOptions, specular_light
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
@@ -197,11 +197,11 @@ class Execution:
         return replace(self._run, state=hashlib.sha256(state).hexdigest()[:32])
 
 
-def _account(part: Gathered) -> dict[str, Any]:
+def _account(part: Gathered | GatheredByDepth) -> dict[str, Any]:
     return {"ranks": list(part.ranks), "bounces": part.bounces}
 
 
-def _left_out(part: Gathered) -> list[str]:
+def _left_out(part: Gathered | GatheredByDepth) -> list[str]:
     return [
         f"interreflections after {part.bounces}: next to no light",
         f"singular values of the first bounce below {part.left_out:.1%} of its energy's root",

@@ -6,6 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility, RowSelection
@@ -23,6 +24,7 @@ from mi_sparse_prt.operators.visibility import Visibility
 _KINDS: dict[str, type[Operator]] = {
     operator.kind: operator
     for operator in (
+        ByDepth,
         Clustered,
         Dense,
         FactoredVisibility,

@@ -149,7 +149,7 @@ class SparsePRT(mi.SamplingIntegrator):
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:
         """All light but that which lamps send to the camera directly or after one reflection."""
-        irradiance = np.zeros((surfaces.n_vertices, 3), np.float32)
+        irradiance = np.zeros((1, surfaces.n_vertices, 3), np.float32)
         depth = self._settings["max_depth"]
         if lamps and depth != 2:
             irradiance += self._light_of_lamps(surfaces)
@@ -158,7 +158,7 @@ class SparsePRT(mi.SamplingIntegrator):
             return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         if not transport.terms:
-            irradiance += transport.irradiance(environment)
+            irradiance = irradiance + transport.irradiance_by_depth(environment)
             return [RelitScene(surfaces, irradiance, environment, None, depth, followed)]
         relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment)]
         return [*relit, RelitScene(surfaces, irradiance, None, None, depth, followed)] if lamps else relit

@@ -50,15 +50,15 @@ class RelitScene:
     Parameters
     ----------
     scene : Scene
-    irradiance : (n_v, 3) float32
-        Irradiance / pi at the vertices: ``LightTransport.irradiance``.
+    irradiance : (k, n_v, 3) float32
+        Irradiance / pi at the vertices, of light that met 0, 1, ... surfaces at most: what a camera's ray met before is
+        taken from the last, which is all light (``LightTransport.irradiance_by_depth``).
     background : mi.Emitter or None
         What rays see that leave the scene.
     lamps : (SampledEmission, (size, 3) float32), optional
         Light of the scene that is seen itself, and how bright they are.
     max_depth : int
-        As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts. That light of the vertices has
-        made fewer bounces then is left out of account.
+        As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts.
     followed : sequence of mi.BSDF, optional
         Of surfaces that rays go on from by all that these scatter.
     """
@@ -75,7 +75,8 @@ class RelitScene:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self.max_depth, self.followed = max_depth, followed
         self._goes_on = scene.specular or bool(followed)
-        self._irradiance = mi.Color3f(np.ascontiguousarray(irradiance.T))
+        self._irradiance = _of_depths(irradiance)
+        self._deepest, self._n_vertices = len(irradiance) - 1, scene.n_vertices
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self._backs = mi.Int32(scene.backs.astype(np.int32))
@@ -86,7 +87,7 @@ class RelitScene:
         """Radiance towards the origins of rays (world), and which rays meet a surface."""
         if self._goes_on:
             return follow(self._seen, ray, sampler, active, self.max_depth)
-        found = self._met(ray, mi.Point2f(0.5), active, active)
+        found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), active, active)
         value = found.radiance
         if self._background is not None:
             value = dr.select(active & ~found.si.is_valid(), self._background.eval(found.si, active), value)
@@ -95,7 +96,7 @@ class RelitScene:
     def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
         """See ``follow``."""
         u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
-        value, si, whole = self._met(ray, u, active, active & ~way.last)
+        value, si, whole = self._met(ray, u, way.depth, active, active & ~way.last)
         if self._background is not None:
             value += background_light(self._background, ray, way, active & ~si.is_valid())
             if self.followed:
@@ -103,15 +104,18 @@ class RelitScene:
                 value += reflected_background(self._background, self._scene, si, sampler, reflects)
         return Seen(value, si, whole)
 
-    def _met(self, ray: mi.Ray3f, u: mi.Point2f, active: mi.Mask, reflects: mi.Mask) -> Seen:
-        """What rays meet; with the radiance of surfaces only where these are asked for, and are not followed."""
+    def _met(
+        self, ray: mi.Ray3f, u: mi.Point2f, depth: mi.UInt32, active: mi.Mask, reflects: mi.Mask
+    ) -> Seen:
+        """What rays meet after some surfaces; their radiance where it is asked for and they are not followed."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
         whole = is_one_of(self.followed, si)
         valid = reflects & si.is_valid() & ~whole
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
         corners, lit = self._hit_corners(hit, valid, behind)
-        value = dr.select(lit, self._shaded(si, corners, u, lit), 0)
+        light = (self._deepest - dr.minimum(depth, self._deepest)) * self._n_vertices
+        value = dr.select(lit, self._shaded(si, corners, light, u, lit), 0)
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
@@ -133,12 +137,19 @@ class RelitScene:
         return list(zip(vertices, (1 - u - v, u, v), strict=True)), valid
 
     def _shaded(
-        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+        self,
+        si: mi.SurfaceInteraction3f,
+        corners: list[Corner],
+        light: mi.UInt32,
+        u: mi.Point2f,
+        valid: mi.Mask,
     ) -> mi.Color3f:
-        """Radiance that leaves surfaces, but for what they scatter into single directions."""
-        irradiance, albedo = (
-            interpolated(values, corners, valid) for values in (self._irradiance, self._albedo)
-        )
+        """Radiance that leaves surfaces, but for what they scatter into single directions.
+
+        ``light`` is where light of as many surfaces as it may have met begins among that of all.
+        """
+        irradiance = interpolated(self._irradiance, corners, valid, light)
+        albedo = interpolated(self._albedo, corners, valid)
         bsdf = si.bsdf()
         flags = bsdf.flags()
         diffuse = ~mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Delta)
@@ -153,9 +164,16 @@ class RelitScene:
         return irradiance * reflected
 
 
-def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
-    """Values of vertices at points of triangles."""
-    return sum((w * dr.gather(mi.Color3f, values, i, valid) for i, w in corners), mi.Color3f(0))
+def interpolated(
+    values: mi.Color3f, corners: list[Corner], valid: mi.Mask, first: mi.UInt32 | int = 0
+) -> mi.Color3f:
+    """Values of vertices at points of triangles; those of vertex 0 come first, or at ``first``."""
+    return sum((w * dr.gather(mi.Color3f, values, first + i, valid) for i, w in corners), mi.Color3f(0))
+
+
+def _of_depths(values: NDArray[np.float32]) -> mi.Color3f:
+    """Colours (k, n_v, 3) of vertices on the device, those of each depth after the other."""
+    return mi.Color3f(np.ascontiguousarray(values.reshape(-1, 3).T))
 
 
 class GlossyRelitScene(RelitScene):
@@ -182,12 +200,15 @@ class GlossyRelitScene(RelitScene):
         self, scene: Scene, transport: LightTransport, environment: Any, background: mi.Emitter | None
     ) -> None:
         transport = transport.for_scene(scene)
-        found, surfaces = transport.coefficients(environment), transport.reflection
+        found, surfaces = transport.coefficients_by_depth(environment), transport.reflection
         assert isinstance(surfaces, InOutFactors)
         followed = surfaces_to_follow(scene, surfaces)
-        super().__init__(scene, found.unit_albedo, background, None, transport.max_depth, followed)
+        irradiance = np.stack([some.unit_albedo for some in found])
+        super().__init__(scene, irradiance, background, None, transport.max_depth, followed)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
-        self._terms = [mi.Color3f(np.ascontiguousarray(b.T)) for b in np.moveaxis(found.terms, 1, 0)]
+        self._terms = [
+            _of_depths(np.stack([some.terms[:, k] for some in found])) for k in range(transport.terms)
+        ]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
         self._material = mi.UInt32(np.maximum(surfaces.material, 0).astype(np.uint32))
         self._glossy = mi.Bool(surfaces.material >= 0)
@@ -204,7 +225,12 @@ class GlossyRelitScene(RelitScene):
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
 
     def _shaded(
-        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+        self,
+        si: mi.SurfaceInteraction3f,
+        corners: list[Corner],
+        light: mi.UInt32,
+        u: mi.Point2f,
+        valid: mi.Mask,
     ) -> mi.Color3f:
         glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
         material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
@@ -214,8 +240,8 @@ class GlossyRelitScene(RelitScene):
             diffuse = dr.select(textured, mi.Color3f(texture.eval(si, textured)), diffuse)
         total = dr.select(
             glossy,
-            interpolated(self._irradiance, corners, glossy) * diffuse,
-            super()._shaded(si, corners, u, valid),
+            interpolated(self._irradiance, corners, glossy, light) * diffuse,
+            super()._shaded(si, corners, light, u, valid),
         )
         towards = si.to_world(si.wi)
         normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
@@ -225,7 +251,7 @@ class GlossyRelitScene(RelitScene):
             local = mi.Frame3f(s, dr.cross(normal, s), normal).to_local(towards)
             lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
             for k, values in enumerate(self._terms):
-                coefficient = weight * dr.gather(mi.Color3f, values, vertex, glossy)
+                coefficient = weight * dr.gather(mi.Color3f, values, light + vertex, glossy)
                 total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)
         return total
 
@@ -316,7 +342,10 @@ def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> R
     if transport.terms:
         return GlossyRelitScene(scene, transport, environment, background)
     dark = transport.measurement.kind != "vertices"
-    irradiance = np.zeros((scene.n_vertices, 3), np.float32) if dark else transport.irradiance(environment)
+    if dark:
+        irradiance = np.zeros((1, scene.n_vertices, 3), np.float32)
+    else:
+        irradiance = transport.irradiance_by_depth(environment)
     followed = () if dark or lamps is not None else surfaces_to_follow(scene, transport.reflection)
     return RelitScene(scene, irradiance, background, lamps, transport.max_depth, followed)
 

@@ -7,7 +7,7 @@ and the solid angle are analytic), a 16-bit mean cosine in the texel basis.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,25 @@ Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, wor
 ALL = 0.999  # of the light: what lets as much pass is not there
 
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
+
+
+class _Passed(NamedTuple):
+    """Light that comes straight through surfaces.
+
+    Attributes
+    ----------
+    share : Float
+        Of colours the mean.
+    surfaces : UInt32
+        That it met.
+    whole : Mask
+        As if nothing was there. Cut-outs are holes in what is around them; boundaries without a reflection are not, in
+        so far as light is told apart by depth.
+    """
+
+    share: mi.Float
+    surfaces: mi.UInt32
+    whole: mi.Mask
 
 
 class DirectSolver:
@@ -140,27 +159,33 @@ class DirectSolver:
         """Which points see the sky in a direction (unit, world), and the cosine; lanes side by side.
 
         Below the horizon no ray is traced and nothing is seen. Surfaces are in the way; where specular light is apart,
-        those are not that let all light pass.
+        those are not that let all light pass; but boundaries that do nothing else, where light is told apart by depth.
         """
         cosine = dr.dot(self._points.normal(point), direction)
         active &= cosine > 0
         ray = start_ray(self._points, point, direction)
         if self.problem.specular_apart and self.problem.scene.passes_straight:
-            return active & (self._transmittance(ray, active) >= ALL), cosine
+            return active & self._transmittance(ray, active).whole, cosine
         return active & ~self.scene.ray_test(ray, active=active), cosine
 
     def partly_passed(
         self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
     ) -> NDArray[np.float32]:
-        """Unit-albedo transport of listed elements that surfaces let a part through of, and not all, (n,) float32.
+        """Unit-albedo transport of listed elements that surfaces let through, but for what counts as seen (``trace``).
 
         Parameters
         ----------
         point_ids, texel_ids : (n,) integers
         seed : int, optional
             Texel basis: another seed gives an independent estimate.
+
+        Returns
+        -------
+        (n, k) float32
+            By how many surfaces it met, 1 to k, where light is told apart by these; else k is 1.
         """
-        result = np.zeros(len(point_ids), np.float32)
+        depths = max(self.problem.depths_apart, 1)
+        result = np.zeros((len(point_ids), depths), np.float32)
         size = LANES // (4 * self.rays_per_element)
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
@@ -173,32 +198,38 @@ class DirectSolver:
                 own = self.seed if seed is None else seed
                 direction, area, total = self._inside(point, texel, stratum, own)
             cosine = dr.dot(self._points.normal(point), direction)
-            share = self._transmittance(start_ray(self._points, point, direction), cosine > 0)
-            value = dr.select((cosine > 0) & (share < ALL), share * cosine * area, 0)
-            result[part] = (dr.block_reduce(dr.ReduceOp.Add, value, self.rays_per_element) / total).numpy()
-        return result * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
+            passed = self._transmittance(start_ray(self._points, point, direction), cosine > 0)
+            value = dr.select((cosine > 0) & ~passed.whole, passed.share * cosine * area, 0)
+            apart = [dr.select(passed.surfaces == k + 1, value, 0) for k in range(depths)]
+            sums = [
+                dr.block_reduce(dr.ReduceOp.Add, one, self.rays_per_element) / total
+                for one in (apart if self.problem.depths_apart else [value])
+            ]
+            dr.eval(sums)
+            result[part] = np.stack([one.numpy() for one in sums], axis=1)
+        return result * (self.lighting.solid_angles[texel_ids] / np.float32(np.pi))[:, None]
 
     @dr.syntax
-    def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
-        """The share of light that comes straight through surfaces, each of which counts as a bounce.
-
-        Of colours the mean.
-        """
+    def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:
+        """Light that comes straight through surfaces, each of which counts as a bounce."""
         depth = self.problem.max_depth
         most = dr.opaque(mi.UInt32, depth - 2 if depth >= 0 else 1 << 30)
-        share, count = mi.Float(1), mi.UInt32(0)
+        apart, scatters = self.problem.depths_apart > 0, int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
+        share, count, boundary = mi.Float(1), mi.UInt32(0), mi.Mask(False)
         ray, active = mi.Ray3f(ray), mi.Mask(active)
         while active:
             hit = self.scene.ray_intersect_preliminary(ray, active=active)
             active &= hit.is_valid()
-            through = active & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null) & (count < most)
+            flags = hit.shape.bsdf().flags()
+            through = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (count < most)
             si = hit.compute_surface_interaction(ray, active=through)
             passed = dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
             share = dr.select(active, dr.select(through, share * passed, 0), share)
-            count += 1
+            count += dr.select(through, 1, 0)
+            boundary |= through & ((flags & scatters) == 0)
             ray = si.spawn_ray(ray.d)
             active &= share > 0
-        return share
+        return _Passed(share, count, (share >= ALL) & (~boundary if apart else True))
 
     def weighted_means(
         self, points: mi.UInt32, texels: mi.UInt32, weights: Weights, seed: int | None = None

@@ -7,6 +7,7 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,11 +22,11 @@ from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import random_combinations
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
-from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
@@ -33,7 +34,13 @@ from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.radiosity import NEGLIGIBLE, FiniteElements, Gathered
+from mi_sparse_prt.solvers.radiosity import (
+    NEGLIGIBLE,
+    FiniteElements,
+    Gathered,
+    GatheredByDepth,
+    joined_channels,
+)
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import contacts
@@ -53,8 +60,8 @@ class GlossyGather(FiniteElements):
 
     Parameters
     ----------
-    matrix : (n, n) sparse float32
-        Of ``glossy_gather_matrix``.
+    matrices : sequence of (n, n) sparse float32
+        As for ``FiniteElements``.
     albedo : (n,) float32
         Of the diffuse part of each vertex; 1 for terms.
     problem : Problem
@@ -64,7 +71,7 @@ class GlossyGather(FiniteElements):
 
     def __init__(
         self,
-        matrix: scipy.sparse.csr_array,
+        matrices: Sequence[scipy.sparse.csr_array],
         albedo: Floats,
         problem: Problem,
         direct: FactoredVisibility,
@@ -74,7 +81,7 @@ class GlossyGather(FiniteElements):
         term = np.tile(np.arange(1, direct.terms + 1), len(direct.glossy)).astype(np.uint64)
         keys = [points.keys, mix(np.repeat(points.keys[direct.glossy], direct.terms) + term)]
         super().__init__(
-            matrix,
+            matrices,
             albedo[None],
             np.concatenate(keys),
             Nodes(np.arange(direct.shape[0]), None),
@@ -231,8 +238,8 @@ def glossy_indirect(
     rays_per_vertex: int,
     tolerance: float,
     seed: int,
-    specular: SparseRows | None = None,
-) -> tuple[Gathered, float]:
+    specular: SparseRows | ByDepth | None = None,
+) -> tuple[Gathered | GatheredByDepth, float]:
     """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
     Parameters
@@ -245,7 +252,7 @@ def glossy_indirect(
     tolerance : float
         As for ``RadiositySolver.indirect``; no less than the noise of the rays, whose rank is full.
     seed : int
-    specular : SparseRows, optional
+    specular : SparseRows or ByDepth, optional
         Light from the sky by way of mirrors and glass, which surfaces send on as well. What they send on by way of
         mirrors and glass reaches unit-albedo rows, and of glossy surfaces as far as these are diffuse.
     """
@@ -256,26 +263,42 @@ def glossy_indirect(
     after_mirrors = _after_mirrors(problem, direct.shape[0], rays_per_vertex, seed)
     found = []
     for channel, shade in enumerate(albedo.T):
-        matrix = gather_matrix(direct, rays, channel)
-        matrix = matrix if after_mirrors is None else scipy.sparse.csr_array(matrix + after_mirrors)
-        solver = GlossyGather(matrix, np.concatenate([shade, ones]), problem, direct, seed)
-        sent: Operator = direct if specular is None else Sum((direct, specular.channel(channel)))
-        found.append(solver.indirect(sent, max(tolerance, min(noise, MOST_NOISE))))
+        matrices = [gather_matrix(direct, rays, channel), *after_mirrors]
+        solver = GlossyGather(matrices, np.concatenate([shade, ones]), problem, direct, seed)
+        own = None if specular is None else _channel(specular, channel)
+        found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE)), own))
+    return _joined(found), noise
+
+
+def _channel(specular: SparseRows | ByDepth, number: int) -> Operator:
+    """One of three channels alone."""
+    if isinstance(specular, ByDepth):
+        return ByDepth(tuple(t.channel(number) for t in specular.terms if isinstance(t, SparseRows)))
+    return specular.channel(number)
+
+
+def _joined(found: list[Gathered | GatheredByDepth]) -> Gathered | GatheredByDepth:
+    """Light of several channels, each of which was found on its own."""
+    by_depth = [f for f in found if isinstance(f, GatheredByDepth)]
+    if by_depth:
+        return joined_channels(by_depth)
+    summed = [f for f in found if isinstance(f, Gathered)]
     return Gathered(
-        tuple(f.left[0] for f in found),
-        tuple(f.right[0] for f in found),
-        max(f.left_out for f in found),
-        max(f.bounces for f in found),
-    ), noise
+        tuple(f.left[0] for f in summed),
+        tuple(f.right[0] for f in summed),
+        max(f.left_out for f in summed),
+        max(f.bounces for f in summed),
+    )
 
 
-def _after_mirrors(problem: Problem, rows: int, rays: int, seed: int) -> scipy.sparse.csr_array | None:
-    """What G (rows, rows) lacks without specular surfaces, for unit-albedo rows; None where there are none."""
+def _after_mirrors(problem: Problem, rows: int, rays: int, seed: int) -> list[scipy.sparse.csr_array]:
+    """G_1, G_2, ... (rows, rows) of unit-albedo rows; none where there are no specular surfaces."""
     if not problem.specular_apart:
-        return None
-    matrix = specular_form_factors(problem, np.arange(len(problem.points)), rays, seed)
-    matrix.resize((rows, rows))
-    return matrix
+        return []
+    matrices = specular_form_factors(problem, np.arange(len(problem.points)), rays, seed)
+    for matrix in matrices:
+        matrix.resize((rows, rows))
+    return matrices
 
 
 def _channels(reflection: Reflection, least: int) -> tuple[Floats, Floats]:

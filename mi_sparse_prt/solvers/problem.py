@@ -12,6 +12,8 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
 from mi_sparse_prt.scene.scene import Scene
 
+MOST_APART = 8  # surfaces; of light that met more there is little, and telling it apart takes ever longer
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -48,6 +50,12 @@ class Problem:
         """Where rows hold, in the scene's normalised frame."""
         assert self.measurement.normalised is not None
         return self.measurement.normalised
+
+    @property
+    def depths_apart(self) -> int:
+        """How many surfaces light may meet, where it is told apart by their number (``ByDepth``); 0 where it is not."""
+        most = self.max_depth - 2
+        return most if self.specular_apart and 0 < most <= MOST_APART else 0
 
     @property
     def channels(self) -> int:

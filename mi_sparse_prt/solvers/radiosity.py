@@ -7,12 +7,17 @@ of unit-albedo transport is the Neumann series X = G rho D + G rho G rho D + ...
 Indirect light is smooth. Where a scene has more vertices than it needs, G has rows at some of them only, the nodes, and
 others take their light from these: X = W (G rho D + G rho W G rho D + ...). D and rho stay those of all vertices.
 
+Where surfaces are seen by way of mirrors or glass, light is told apart by how many surfaces it met, as ``max_depth``
+counts them all: X_s = sum over k < s of G_k rho (E_(s-1-k) + X_(s-1-k)), G_k being the form factors after k of those,
+and E_t the light that arrives after t of them (E_0 = D). The first bounces of all s are rows of one matrix.
+
 G also blurs the shadows' edges in D: what is left has a low rank, and ``RadiositySolver.indirect`` computes few of its
 columns and rows (``first_bounce``). Later bounces are those of its singular vectors.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,11 +26,15 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.sparse_rows import SparseRows
+from mi_sparse_prt.operators.stacked import Stacked
 from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
@@ -39,6 +48,7 @@ NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any 
 LONGEST = 1024  # bounces after which light is taken not to end
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -73,13 +83,38 @@ class LowRankOptions:
     later: float = 0.25
 
 
+@dataclass(frozen=True)
+class GatheredByDepth(ByDepth):
+    """Indirect light told apart by how many surfaces it met, and how it was found.
+
+    Attributes
+    ----------
+    left_out : float
+        Estimated relative L2 error of first bounces, for their low rank alone.
+    """
+
+    terms: tuple[LowRank, ...]
+    left_out: float
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        """Of each channel, the largest of all depths."""
+        return tuple(max(some) for some in zip(*(term.ranks for term in self.terms), strict=True))
+
+    @property
+    def bounces(self) -> int:
+        """Surfaces that light may have met."""
+        return len(self.terms)
+
+
 class FiniteElements:
     """Interreflections between vertices, or whatever else rows of light stand for.
 
     Parameters
     ----------
-    matrix : (n_nodes, n) sparse float32
-        G.
+    matrices : sequence of (n_nodes, n) sparse float32
+        G_0, G_1, ...: form factors after so many specular surfaces; where light is not told apart by depth, only their
+        sum counts.
     albedo : (channels, n) float32
     keys : (n,) uint64
         Random numbers are made of them.
@@ -94,12 +129,14 @@ class FiniteElements:
 
     Attributes
     ----------
+    matrix : (n_nodes, n) sparse float32
+        G, the sum of all.
     options : LowRankOptions
     """
 
     def __init__(
         self,
-        matrix: scipy.sparse.csr_array,
+        matrices: Sequence[scipy.sparse.csr_array],
         albedo: Floats,
         keys: NDArray[np.uint64],
         nodes: Nodes,
@@ -107,7 +144,10 @@ class FiniteElements:
         max_depth: int,
         seed: int,
     ) -> None:
-        self.matrix, self._albedo, self._keys, self.nodes = matrix, albedo, keys, nodes
+        self.matrix = (
+            matrices[0] if len(matrices) == 1 else scipy.sparse.csr_array(sum(matrices[1:], matrices[0]))
+        )
+        self._matrices, self._albedo, self._keys, self.nodes = matrices, albedo, keys, nodes
         self.contacts, self.max_depth, self.seed = contacts, max_depth, seed
         self.channels, self.options = len(albedo), LowRankOptions()
 
@@ -191,7 +231,7 @@ class FiniteElements:
 
     def indirect(
         self, direct: Operator, tolerance: float = 0.03, specular: Operator | None = None
-    ) -> Gathered:
+    ) -> Gathered | GatheredByDepth:
         """Indirect light for all texels, factored.
 
         Parameters
@@ -205,9 +245,12 @@ class FiniteElements:
 
         Returns
         -------
-        Gathered
+        Gathered or GatheredByDepth
+            The latter if ``specular`` is told apart by depth.
         """
         direct = self._lit(direct)
+        if isinstance(specular, ByDepth):
+            return self._by_depth((direct, *specular.terms[:-1]), tolerance)
         if specular is not None:
             direct = Sum((direct, specular))
         count = self._count_for(direct)
@@ -222,6 +265,70 @@ class FiniteElements:
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
+
+    def _by_depth(self, lights: Sequence[Operator], tolerance: float) -> GatheredByDepth:
+        """Indirect light that met 1, 2, ... surfaces, from light E_0, E_1, ... that met as many specular ones."""
+        colours = max(light.shape[2] for light in lights)
+        if colours == 1:
+            return self._by_depth_of(lights, self._albedo, tolerance)
+        found = []
+        for c in range(colours):
+            own = [light.channel(c) if isinstance(light, SparseRows) else light for light in lights]
+            found.append(self._by_depth_of(own, self._albedo[[min(c, self.channels - 1)]], tolerance))
+        return joined_channels(found)
+
+    def _by_depth_of(self, lights: Sequence[Operator], albedo: Floats, tolerance: float) -> GatheredByDepth:
+        """``_by_depth`` of light of one channel."""
+        count = len(lights)
+        lit = [t for t, light in enumerate(lights) if t == 0 or not _is_dark(light)]
+        blocks = [[self._matrices[s - t] if t <= s else None for t in lit] for s in range(count)]
+        keys = self._keys[self.nodes.ids]
+        first = first_bounce(
+            scipy.sparse.block_array(blocks, format="csr"),
+            np.tile(albedo, len(lit)),
+            Stacked(tuple(lights[t] for t in lit)),
+            np.concatenate([mix(keys + np.uint64(s)) if s else keys for s in range(count)]),
+            tolerance,
+            self.seed,
+            self.options.basis,
+        )
+        light = [np.split(x, count) for x in first.left]  # [channel][depth]
+        sizes = [np.square(right).sum(axis=1, dtype=np.float64) for right in first.right]
+        energies = [sum(map(_energies, x)) * size for x, size in zip(light, sizes, strict=True)]
+        least = self.options.later * tolerance**2 * sum(float(e.sum()) for e in energies)
+        for s in range(1, count):
+            for k in range(s):
+                self._reflect(light, s - 1 - k, k, albedo, sizes, least / count)
+        return GatheredByDepth(self._terms(light, sizes, first.right, least), first.left_out)
+
+    def _reflect(
+        self,
+        light: list[list[Floats]],
+        depth: int,
+        met: int,
+        albedo: Floats,
+        sizes: list[Doubles],
+        least: float,
+    ) -> None:
+        """Add what light of a depth, the first being 0, becomes by one bounce and some specular surfaces after it."""
+        energies = [_energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
+        for x, rho, kept in zip(light, albedo, all_but_least(energies, least), strict=True):
+            if kept.any():
+                some = self.nodes.interpolate(np.ascontiguousarray(x[depth][:, kept]))
+                x[depth + 1 + met][:, kept] += multiply_scaled(self._matrices[met], rho[None], some)[0]
+
+    def _terms(
+        self, light: list[list[Floats]], sizes: list[Doubles], right: Sequence[Floats], least: float
+    ) -> tuple[LowRank, ...]:
+        """Low ranks of each depth: singular vectors are left out of which it has next to nothing."""
+        every = [_energies(x) * size for own, size in zip(light, sizes, strict=True) for x in own]
+        kept = iter(all_but_least(every, least))
+        channels = []
+        for own, b in zip(light, right, strict=True):
+            some = [(x, next(kept)) for x in own]
+            channels.append([(self.nodes.interpolate(np.ascontiguousarray(x[:, k])), b[k]) for x, k in some])
+        depths = zip(*channels, strict=True)
+        return tuple(LowRank(tuple(a for a, _ in some), tuple(b for _, b in some)) for some in depths)
 
     def _all_bounces(self, first: FirstBounce, count: int, expendable: float) -> list[Floats]:
         """The left factors after ``count`` bounces.
@@ -367,15 +474,18 @@ class RadiositySolver(FiniteElements):
         direct : Operator
             Of the vertices.
         tolerance, specular
-            As for ``indirect``.
+            As for ``indirect``; light is not told apart by depth.
         """
         points, every = problem.points, np.arange(len(problem.points))
-        matrix = form_factors(problem, self._rays_per_vertex, self.seed, every)
+        found = form_factors(problem, self._rays_per_vertex, self.seed, every)
+        matrix = scipy.sparse.csr_array(sum(found[1:], found[0]))
         self.rays += len(points) * self._rays_per_vertex
         lit = self._lit(direct)
         lit = lit if specular is None else Sum((lit, specular))
         first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
+        specular = Sum(specular.terms) if isinstance(specular, ByDepth) else specular
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
+        assert isinstance(before, Gathered)
         again = [
             multiply_scaled(matrix, rho[None], x)[0] for rho, x in zip(self._albedo, before.left, strict=True)
         ]
@@ -387,14 +497,29 @@ class RadiositySolver(FiniteElements):
         )
 
 
+def _is_dark(light: Operator) -> bool:
+    return isinstance(light, SparseRows) and not any(matrix.nnz for matrix in light.matrices)
+
+
 def _energies(x: Floats) -> NDArray[np.float64]:
     """Of each column."""
     return np.square(x).sum(axis=0, dtype=np.float64)
 
 
-def form_factors(problem: Problem, rays: int, seed: int, ids: NDArray[np.integer]) -> scipy.sparse.csr_array:
-    """G (n, n_v) of some of a problem's points; rays go on through specular surfaces where their light is apart."""
+def joined_channels(found: Sequence[GatheredByDepth]) -> GatheredByDepth:
+    """Light of several channels, each of which was found on its own."""
+    terms = (
+        LowRank(tuple(t.left[0] for t in some), tuple(t.right[0] for t in some))
+        for some in zip(*(f.terms for f in found), strict=True)
+    )
+    return GatheredByDepth(tuple(terms), max(f.left_out for f in found))
+
+
+def form_factors(
+    problem: Problem, rays: int, seed: int, ids: NDArray[np.integer]
+) -> list[scipy.sparse.csr_array]:
+    """G_0, G_1, ... (n, n_v) of some of a problem's points, after as many specular surfaces (``FiniteElements``)."""
     matrix = gather_matrix(problem.scene, problem.points, rays, seed, ids)
     if not problem.specular_apart:
-        return matrix
-    return scipy.sparse.csr_array(matrix + specular_form_factors(problem, ids, rays, seed))
+        return [matrix]
+    return [matrix, *specular_form_factors(problem, ids, rays, seed)]

@@ -6,8 +6,10 @@ goes straight through (masks, thin panes, ``null``) needs no random rays: see ``
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -27,6 +30,7 @@ ROUNDS = 3  # after the first rays
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -51,22 +55,40 @@ class SpecularOptions:
     strata: int = 2
 
 
-class SpecularLight(NamedTuple):
+@dataclass(frozen=True)
+class SpecularLight:
     """Light from the sky by way of specular surfaces alone.
 
     Attributes
     ----------
-    operator : SparseRows
-        Unit-albedo transport.
+    matrices : tuple of (n, k * n_directions) sparse float32
+        Unit-albedo transport of all channels, or of each of three: side by side that of light which met 1, 2, ... k
+        surfaces, where it is told apart by these; else k is 1.
+    depths_apart : int
+        k, or 0.
     noise : float
         Its relative L2 error, as estimated from two halves.
     rays : int
         That were traced.
     """
 
-    operator: SparseRows
+    matrices: tuple[Sparse, ...]
+    depths_apart: int
     noise: float
     rays: int
+
+    @cached_property
+    def operator(self) -> SparseRows | ByDepth:
+        """Its operator, (n, n_directions)."""
+        if not self.depths_apart:
+            return SparseRows(self.matrices)
+        cuts = np.linspace(0, self.matrices[0].shape[1], self.depths_apart + 1).astype(int)
+        return ByDepth(
+            tuple(
+                SparseRows(tuple(scipy.sparse.csr_array(m[:, a:b]) for m in self.matrices))
+                for a, b in itertools.pairwise(cuts)
+            )
+        )
 
 
 class _Limit(NamedTuple):
@@ -121,10 +143,10 @@ def specular_light(
     halves = [half for estimate in found for half in estimate.halves]
     mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
-    operator = SparseRows(tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean)))
+    matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
     square, noise = sum(part.square for part in found), sum(part.noise for part in found)
     rays = sum(part.rays for part in found)
-    return SpecularLight(operator, float(np.sqrt(noise / max(square, 1e-300))), rays)
+    return SpecularLight(matrices, problem.depths_apart, float(np.sqrt(noise / max(square, 1e-300))), rays)
 
 
 class _Arriving:
@@ -132,7 +154,7 @@ class _Arriving:
 
     def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
         self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
-        self._size = problem.emission.size
+        self._size = problem.emission.size * max(problem.depths_apart, 1)
         self._cells = self._chains.find_cells(ids, next(self._seeds))
 
     def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
@@ -215,17 +237,28 @@ def _passing(
         solver, halves = DirectSolver(problem, strata), []
         for seed in seeds[-2:]:
             values = solver.partly_passed(ids[rows], texels, seed)
-            half = scipy.sparse.coo_array((values, (rows, texels)), shape=found.shape).tocsr()
-            half.eliminate_zeros()
-            halves.append([half] * 3)
+            halves.append([_side_by_side(values, rows, texels, found.shape)] * 3)
         traced += 2 * len(rows) * strata**2
         return _compared(halves, power, traced)
 
     return _refined(sampled, options.strata, limit)
 
 
+def _side_by_side(values: Floats, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
+    """Light (m, k) of elements, told apart by depth, as a matrix (n, k * n_directions)."""
+    depths = values.shape[1]
+    columns = texels[:, None] + np.arange(depths) * (shape[1] // depths)
+    place = np.repeat(rows, depths), columns.ravel()
+    found = scipy.sparse.coo_array((values.ravel(), place), shape=shape).tocsr()
+    found.eliminate_zeros()
+    return found
+
+
 def _with_neighbours(found: Sparse, problem: Problem) -> tuple[Ids, Ids]:
-    """Rows and columns of a matrix's elements, and of those that are beside these on the cubemap."""
+    """Rows and texels of a matrix's elements, and of those that are beside these on the cubemap."""
+    place = found.tocoo()
+    at = place.row, place.col % problem.emission.size
+    found = scipy.sparse.coo_array((place.data, at), shape=(found.shape[0], problem.emission.size)).tocsr()
     beside = problem.emission.sides.tables.beside
     texel = np.repeat(np.arange(len(beside)), beside.shape[1])
     ones = np.ones(beside.size + len(beside), np.float32)
@@ -262,14 +295,17 @@ def _unblocked(problem: Problem, power: Doubles) -> float:
 
 
 def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
-    """Light (n, m) of texels, at some points, of which surfaces on the way let a part through, straight on.
+    """Light (n, k * m) of texels, at some points, of which surfaces on the way let a part through, straight on.
 
-    All of it, and nothing, is told by bits; here is what lies between.
+    All of it, and nothing, is told by bits; here is what lies between, side by side by depth (``SpecularLight``).
     """
-    size = direct.lighting.size
-    blocks = [scipy.sparse.csr_array((0, size), dtype=np.float32)]
+    size, depths = direct.lighting.size, max(direct.problem.depths_apart, 1)
+    blocks = [scipy.sparse.csr_array((0, size * depths), dtype=np.float32)]
     for a in range(0, len(ids), max(1, LANES // size)):
         some = np.asarray(ids[a : a + max(1, LANES // size)])
         place = np.repeat(some, size), np.tile(np.arange(size), len(some))
-        blocks.append(scipy.sparse.csr_array(direct.partly_passed(*place).reshape(len(some), size)))
+        values = direct.partly_passed(*place)
+        kept = np.flatnonzero(values.any(axis=1))
+        rows = np.repeat(np.arange(len(some)), size)[kept]
+        blocks.append(_side_by_side(values[kept], rows, place[1][kept], (len(some), size * depths)))
     return scipy.sparse.vstack(blocks, format="csr")

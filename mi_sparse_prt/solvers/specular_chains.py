@@ -57,8 +57,9 @@ class SkyLight(NamedTuple):
 
     Attributes
     ----------
-    light : (3, n, n_directions) float32
-        Unit-albedo transport of points.
+    light : (3, n, k * n_directions) float32
+        Unit-albedo transport of points: side by side that of light which met 1, 2, ... k surfaces, where it is told
+        apart by these; else k is 1.
     squares : (m,) float32
         Of the weights of rays that left the scene, summed over those of each cell.
     """
@@ -90,7 +91,7 @@ class SpecularChains:
         self._rough_glass = problem.scene.rough_glass
         self._points = PointArrays(problem.points)
         self._resolution, self._texels = problem.emission.resolution, problem.emission.size
-        depth = problem.max_depth
+        depth, self._apart = problem.max_depth, problem.depths_apart
         self._longest = LONGEST if depth < 0 else min(depth - 2, LONGEST)
 
     def find_cells(self, ids: Ids, seed: int) -> Cells:
@@ -125,11 +126,13 @@ class SpecularChains:
             FIXED_POINT / (CELLS * strata.astype(float)) ** 2,
         )
         scales = mi.Float(scale.astype(np.float32))
-        sums = [dr.zeros(mi.UInt32, len(ids) * self._texels) for _ in range(3)]
+        columns = self._texels * max(self._apart, 1)
+        sums = [dr.zeros(mi.UInt32, len(ids) * columns) for _ in range(3)]
         squares = dr.zeros(mi.UInt32, len(strata))
         # whole numbers: sums do not depend on the order of rays
-        for ends in self._follow(ray, entry, rng, True):
-            place = dr.gather(mi.UInt32, rows, ends.of) * self._texels + ends.column
+        for depth, ends in enumerate(self._follow(ray, entry, rng, True)):
+            first = dr.opaque(mi.UInt32, depth * self._texels if self._apart else 0)
+            place = dr.gather(mi.UInt32, rows, ends.of) * columns + first + ends.column
             unit = dr.gather(mi.Float, scales, ends.of)
             for c, total in enumerate(sums):
                 dr.scatter_reduce(
@@ -138,29 +141,31 @@ class SpecularChains:
             square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
             dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid)
         dr.eval(*sums, squares)
-        shape = len(ids), self._texels
+        shape = len(ids), columns
         light = np.stack([(total.numpy() / np.float32(FIXED_POINT)).reshape(shape) for total in sums])
         return SkyLight(light, squares.numpy() / np.float32(2**16))
 
-    def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> Sparse:
-        """What cosine-distributed rays from some points find after specular surfaces, by vertices (n, n_v).
+    def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> list[Sparse]:
+        """What cosine-distributed rays from some points find after 1, 2, ... specular surfaces, by vertices (n, n_v).
 
-        Weights of colours are averaged.
+        One matrix after any number of them, where light is not told apart by depth. Weights of colours are averaged.
         """
         n, rays = len(ids), len(samples[0])
         ray, point, _ = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
         lane = dr.arange(mi.UInt32, n * rays)
         row = lane // rays
         rng = random_generator(self._points.key(point), lane - row * rays, mi.UInt32(1), seed)
-        entries: list[tuple[NDArray[Any], ...]] = [(np.zeros(0, np.float32), *(np.zeros(0, np.uint32),) * 2)]
-        for depth, ends in enumerate(self._follow(ray, row, rng, False), 1):
-            if depth < self._longest:  # light of a surface at the end makes one more bounce
-                kept = ends.valid.numpy()
-                weight = ends.weight.numpy().mean(axis=0)
-                entries.append((weight[kept], ends.of.numpy()[kept], ends.column.numpy()[kept]))
-        weights, rows, columns = (np.concatenate(x) for x in zip(*entries, strict=True))
         shape = n, self._surfaces.n_vertices
-        return scipy.sparse.coo_array((weights / np.float32(rays), (rows, columns)), shape=shape).tocsr()
+        found = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(max(self._apart - 1, 1))]
+        for depth, ends in enumerate(self._follow(ray, row, rng, False)):
+            if depth + 1 < self._longest:  # light of a surface at the end makes one more bounce
+                kept = ends.valid.numpy()
+                weight = ends.weight.numpy().mean(axis=0)[kept] / np.float32(rays)
+                place = ends.of.numpy()[kept], ends.column.numpy()[kept]
+                found[depth if self._apart else 0] += scipy.sparse.coo_array(
+                    (weight, place), shape=shape
+                ).tocsr()
+        return found
 
     def _rays_into(
         self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int
@@ -243,8 +248,8 @@ class SpecularChains:
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
 
 
-def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> Sparse:
-    """What G (n, n_v) lacks without specular surfaces: what rays from some points find after these.
+def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> list[Sparse]:
+    """What G (n, n_v) lacks without specular surfaces: what rays from some points find after 1, 2, ... of these.
 
     Parameters
     ----------
@@ -257,11 +262,10 @@ def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> S
 
     Notes
     -----
-    A surface that is found after k specular ones sends out light of as many bounces as any other, k more than
-    Mitsuba's ``path`` would follow at the same depth.
+    Where light is not told apart by depth, there is one matrix. A surface that is found after k specular ones then
+    sends out light of as many bounces as any other, k more than Mitsuba's ``path`` would follow at the same depth.
     """
     chains, samples = SpecularChains(problem), sobol(rays)
     step = max(1, LANES // rays)
-    blocks = [scipy.sparse.csr_array((0, problem.scene.n_vertices), dtype=np.float32)]
-    blocks += [chains.gather_surfaces(ids[a : a + step], samples, seed) for a in range(0, len(ids), step)]
-    return scipy.sparse.vstack(blocks, format="csr").astype(np.float32)
+    blocks = [chains.gather_surfaces(ids[a : a + step], samples, seed) for a in range(0, len(ids), step)]
+    return [scipy.sparse.vstack(some, format="csr").astype(np.float32) for some in zip(*blocks, strict=True)]

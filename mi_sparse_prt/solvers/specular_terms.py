@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import drjit as dr
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.operator import Ids
-from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
@@ -28,10 +28,13 @@ Sparse: TypeAlias = scipy.sparse.csr_array
 
 
 class _Light(NamedTuple):
-    """Light of texels at points: which ones (n,), its directions' weights in terms (n, K), and channels (n, 3)."""
+    """Light at points: which ones (n,), its directions' weights in terms (n, K), and channels (n, 3).
+
+    Columns are those of ``SpecularLight.matrices``.
+    """
 
     rows: NDArray[np.int64]
-    texels: NDArray[np.int64]
+    columns: NDArray[np.int64]
     into: Floats
     light: Floats
 
@@ -55,7 +58,8 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     ids, lobes = reflection.glossy, Lobes(reflection)
     (bent_seed,) = element_seeds(random_stream(seed, SPECULAR, 1), 1)
     chains = _TermChains(problem)
-    shape = len(ids) * reflection.terms, problem.emission.size
+    known = specular.matrices
+    shape = len(ids) * reflection.terms, known[0].shape[1]
     sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
     parts = [chains.bent(ids, lobes, bent_seed)] if problem.scene.bends_light else []
     if problem.scene.passes_straight:
@@ -63,12 +67,11 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     for part in parts:
         for found in part:
             sums = [a + b for a, b in zip(sums, _rows_of_terms(found, shape), strict=True)]
-    known = specular.operator.matrices
     matrices = tuple(
         scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
         for c, terms in enumerate(sums)
     )
-    return SpecularLight(SparseRows(matrices), specular.noise, specular.rays + chains.traced)
+    return replace(specular, matrices=matrices, rays=specular.rays + chains.traced)
 
 
 class _TermChains(SpecularChains):
@@ -89,13 +92,14 @@ class _TermChains(SpecularChains):
             of_lane = some.rows[entry.numpy()]
             point = mi.UInt32(np.asarray(ids)[of_lane].astype(np.uint32))
             into = _weights(lobes, point, ray.d)
-            for ends in self._follow(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True):
+            for depth, ends in enumerate(self._follow(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True)):
                 kept = ends.valid.numpy()
                 lanes, texels, light = (
                     x[kept] for x in (ends.of.numpy(), ends.column.numpy(), ends.weight.numpy().T)
                 )
                 share = light / np.float32((CELLS * STRATA) ** 2)
-                yield _Light(of_lane[lanes], texels.astype(np.int64), into[lanes], share)
+                columns = texels.astype(np.int64) + (depth * self._texels if self._apart else 0)
+                yield _Light(of_lane[lanes], columns, into[lanes], share)
 
 
 def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[_Light]:
@@ -103,11 +107,12 @@ def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[_Light]:
     found = passed_light(DirectSolver(problem), ids).tocoo()
     step = LANES // 8
     for a in range(0, found.nnz, step):
-        rows, texels = (x[a : a + step] for x in found.coords)
+        rows, columns = (x[a : a + step] for x in found.coords)
         point = mi.UInt32(np.asarray(ids)[rows].astype(np.uint32))
+        texels = columns % problem.emission.size
         towards = mi.Vector3f(np.ascontiguousarray(problem.emission.directions[texels].T))
         light = np.repeat(found.data[a : a + step, None], 3, axis=1)
-        yield _Light(rows.astype(np.int64), texels.astype(np.int64), _weights(lobes, point, towards), light)
+        yield _Light(rows.astype(np.int64), columns.astype(np.int64), _weights(lobes, point, towards), light)
 
 
 def _weights(lobes: Lobes, point: mi.UInt32, direction: mi.Vector3f) -> Floats:
@@ -128,7 +133,7 @@ def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
     matrices = []
     for light in found.light.T[: 1 if grey else 3]:
         ends = scipy.sparse.csr_array(
-            (np.ascontiguousarray(light), found.texels, np.arange(count + 1)), shape=(count, shape[1])
+            (np.ascontiguousarray(light), found.columns, np.arange(count + 1)), shape=(count, shape[1])
         )
         matrices.append(scipy.sparse.csr_array(into @ ends).astype(np.float32))
     return matrices * 3 if grey else matrices

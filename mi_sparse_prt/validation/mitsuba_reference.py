@@ -66,7 +66,7 @@ def image_of_vertices(
     seed: int = 0,
 ) -> NDArray[np.float32]:
     """Image (height, width, 3) of a scene from irradiance / pi (n_v, 3) at its vertices, by whatever method."""
-    integrator = RelitIntegrator(RelitScene(scene, irradiance, background))
+    integrator = RelitIntegrator(RelitScene(scene, irradiance[None], background))
     return np.array(mi.render(scene.mitsuba, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[
         ..., :3
     ]

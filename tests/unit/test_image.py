@@ -43,7 +43,7 @@ def looked_at(
     scene: prt.Scene, irradiance: np.ndarray, x: np.ndarray, z: np.ndarray, up: bool = True
 ) -> np.ndarray:
     """Radiance (m, 3) at ground points, seen straight from above (or from below)."""
-    relit = RelitScene(scene, irradiance.astype(np.float32), None)
+    relit = RelitScene(scene, irradiance[None].astype(np.float32), None)
     y, d = (1.0, -1.0) if up else (-1.0, 1.0)
     ray = mi.Ray3f(
         mi.Point3f(mi.Float(x.astype(np.float32)), y, mi.Float(z.astype(np.float32))), mi.Vector3f(0, d, 0)
@@ -70,7 +70,7 @@ def test_each_triangle_has_the_values_of_its_own_corners(grey_scene):
     origins[:, 1] = np.abs(origins[:, 1])
     targets = 0.3 * targets + [0, 0.5, 0]
     ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f((targets - origins).T))
-    relit = RelitScene(grey_scene, values.astype(np.float32), None)
+    relit = RelitScene(grey_scene, values[None].astype(np.float32), None)
     seen, valid = (
         a.numpy() for a in relit.radiance(ray, mi.load_dict({"type": "independent"}), mi.Mask(True))
     )
@@ -200,7 +200,7 @@ def images_of_sky(scene: Scene, depth: int, of_path: bool, seeds: int = 8) -> np
             lit_scene(scene.unlit_shapes(), sky),
         )
     else:
-        dark, followed = np.zeros((scene.n_vertices, 3), np.float32), surfaces_to_follow(scene)
+        dark, followed = np.zeros((1, scene.n_vertices, 3), np.float32), surfaces_to_follow(scene)
         integrator, where = (
             RelitIntegrator(RelitScene(scene, dark, sky, None, depth, followed)),
             scene.mitsuba,
