@@ -80,7 +80,10 @@ def find_backs(
     if not any(material.two_sided for material in materials):
         return [], []
     pieces = _pieces(meshes, materials)
-    bright = _bright_pieces(scene, meshes, pieces, np.zeros((0, 3), np.float32) if lamps is None else lamps)
+    passing = np.repeat([m.passes_light for m in materials], [len(mesh.triangles) for mesh in meshes])
+    bright = _bright_pieces(
+        scene, meshes, pieces, passing, np.zeros((0, 3), np.float32) if lamps is None else lamps
+    )
     found, dark, first = [], [], 0
     for shape, mesh in enumerate(meshes):
         own = pieces[first : first + len(mesh.triangles)]
@@ -123,12 +126,16 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
 
 
 def _bright_pieces(
-    scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids, lamps: NDArray[np.float32]
+    scene: mi.Scene,
+    meshes: Sequence[TriangleMesh],
+    pieces: Ids,
+    passing: NDArray[np.bool_],
+    lamps: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
-    """Which pieces light reaches, (pieces,) bool."""
+    """Which pieces light reaches, (pieces,) bool; ``passing`` (triangles,): light goes through."""
     n = int(pieces.max()) + 1
     sees_light, seen = np.zeros(n, np.bool_), [np.zeros((0, 2), np.int64)]
-    looks = _Looks(scene, meshes, pieces)
+    looks = _Looks(scene, meshes, pieces, passing)
     for lamp in lamps:
         sees_light[looks.from_place(lamp)] = True
     size = np.bincount(pieces[pieces >= 0], minlength=n)
@@ -160,10 +167,14 @@ class _Looks:
         In any frame; normals count.
     pieces : (triangles,) int64
         Of all meshes, see ``_pieces``.
+    passing : (triangles,) bool
+        Whether light goes through.
     """
 
-    def __init__(self, scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids) -> None:
-        self._scene, self._pieces = scene, pieces
+    def __init__(
+        self, scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids, passing: NDArray[np.bool_]
+    ) -> None:
+        self._scene, self._pieces, self._passing = scene, pieces, passing
         self._first = first_triangles(scene)
         corners = np.concatenate(
             [
@@ -191,28 +202,30 @@ class _Looks:
         start = np.repeat(triangles, each)
         sample = np.arange(len(start)) - np.repeat(np.cumsum(each) - each, each)
         triangle = mi.UInt32(start.astype(np.uint32))
-        other = self._met(self._rays(triangle, mi.UInt32(sample.astype(np.uint32)), seed))
+        other, lit = self._met(self._rays(triangle, mi.UInt32(sample.astype(np.uint32)), seed))
         own = self._pieces[start]
         facing = other >= 0
-        return np.unique(own[other == PASSES_LIGHT]), np.unique(
-            np.stack([own[facing], other[facing]], axis=1), axis=0
-        )
+        return np.unique(own[lit]), np.unique(np.stack([own[facing], other[facing]], axis=1), axis=0)
 
     def from_place(self, place: NDArray[np.float32]) -> Ids:
         """Pieces whose backs are seen from a point (3,), looking around."""
         rng = mi.PCG32(size=MANY_RAYS)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-        met = self._met(mi.Ray3f(mi.Point3f(place), direction))
+        met, _ = self._met(mi.Ray3f(mi.Point3f(place), direction))
         return np.unique(met[met >= 0])
 
-    def _met(self, ray: mi.Ray3f) -> Ids:
-        """The piece whose back each ray meets; NO_PIECE of a black one, PASSES_LIGHT for all else."""
+    def _met(self, ray: mi.Ray3f) -> tuple[Ids, NDArray[np.bool_]]:
+        """The piece whose back each ray meets (NO_PIECE of a black one), and whether light comes from there.
+
+        It comes from all that is no back, and from backs that it goes through.
+        """
         hit = self._scene.ray_intersect_preliminary(ray)
         met = hit.is_valid()
         index = dr.select(met, self._first.gather(hit.shape, met) + hit.prim_index, 0)
         # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
         behind = met & (dr.dot(dr.gather(mi.Vector3f, self._backwards, index), ray.d) < 0)
-        return np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)
+        piece = np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)
+        return piece, (piece == PASSES_LIGHT) | (piece >= 0) & self._passing[index.numpy()]
 
     def _rays(self, triangle: mi.UInt32, sample: mi.UInt32, seed: int) -> mi.Ray3f:
         rng = random_generator(dr.gather(mi.UInt64, self._keys, triangle), sample, mi.UInt32(0), seed)

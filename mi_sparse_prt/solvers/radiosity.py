@@ -34,12 +34,12 @@ from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
-from mi_sparse_prt.operators.stacked import Stacked
 from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
+from mi_sparse_prt.solvers.stacked import Stacked
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 

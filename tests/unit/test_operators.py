@@ -11,6 +11,7 @@ import scipy.sparse
 from conftest import made_up
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility, RowSelection
@@ -19,6 +20,7 @@ from mi_sparse_prt.operators.operator import Masked, Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.operators.stored import operator_arrays, operator_from_arrays
 from mi_sparse_prt.operators.sum import Sum
+from mi_sparse_prt.solvers.stacked import Stacked
 
 N, M = 50, 96  # points and directions of made_up
 
@@ -78,6 +80,7 @@ OPERATORS: dict[str, Callable[[], Operator]] = {
     "sparse rows": lambda: sparse_rows(3),
     "grey sparse rows": lambda: sparse_rows(1),
     "sum": lambda: Sum((part("bits", "direct"), part("bits and factored light", "indirect"))),
+    "by depth": lambda: ByDepth((sparse_rows(3), part("bits and factored light", "indirect"))),
     "grey sum": lambda: Sum((part("bits", "direct"), sparse_rows(1))),
     "masked": lambda: Masked(part("shares", "direct"), np.array([1, 7, 30]), some_open()),
     "row selection": lambda: RowSelection(part("bits", "direct"), np.array([3, 3, 0, 49])),
@@ -331,3 +334,17 @@ def test_transposed_and_for_scipy(form):
     assert close(turned @ z, blocks.T @ z)
     with pytest.raises(prt.PrtError, match="channel 3"):
         transport.as_linear_operator(3)
+
+
+def test_rows_below_each_other():
+    """Of operators with the same columns: what each has, as one matrix."""
+    parts = part("shares", "direct"), sparse_rows(1), part("bits", "direct")
+    both, known = Stacked(parts), np.concatenate([p.rows(np.arange(N)) for p in parts])
+    ids, some = np.array([140, 3, 77, 0]), np.array([1, 4, 49, 50, 120])
+    assert both.shape == (3 * N, M, 1) and both.nbytes == sum(p.nbytes for p in parts)
+    assert np.array_equal(both.rows(ids), known[ids])
+    assert close(both.columns(np.arange(9)), known[:, :9])
+    assert close(both.take(some).columns(np.arange(M)), known[some])
+    words, signs = np.array([2, 0]), np.random.default_rng(0).choice([-1, 1], (2, 32)).astype(np.float32)
+    wanted = sum(known[:, 32 * w : 32 * w + 32, 0] * sign for w, sign in zip(words, signs, strict=True))
+    assert close(both.combined(words, signs), wanted)

@@ -33,7 +33,12 @@ class Stacked(Operator):
         return sum(part.nbytes for part in self.parts)
 
     def rows(self, ids: Ids) -> Floats:
-        return self.take(ids).columns(np.arange(self.shape[1]))
+        result, end = np.empty((len(ids), *self.shape[1:]), np.float32), 0
+        for part in self.parts:
+            start, end = end, end + part.shape[0]
+            own = (ids >= start) & (ids < end)
+            result[own] = part.rows(ids[own] - start)
+        return result
 
     def columns(self, ids: Ids) -> Floats:
         return np.concatenate([part.columns(ids) for part in self.parts])
@@ -42,8 +47,9 @@ class Stacked(Operator):
         return np.concatenate([part.combined(words, signs) for part in self.parts])
 
     def take(self, ids: Ids) -> Stacked:
-        """Some rows; ascending ids."""
+        """Some rows, by ascending numbers: those of each part stay together."""
         starts = np.cumsum([0, *(part.shape[0] for part in self.parts)])
         cuts = np.searchsorted(ids, starts)
-        own = zip(self.parts, starts, cuts, cuts[1:], strict=False)
-        return Stacked(tuple(part.take(ids[a:b] - start) for part, start, a, b in own))
+        return Stacked(
+            tuple(part.take(ids[cuts[i] : cuts[i + 1]] - starts[i]) for i, part in enumerate(self.parts))
+        )
