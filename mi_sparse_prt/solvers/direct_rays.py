@@ -28,6 +28,21 @@ ALL = 0.999  # of the light: what lets as much pass is not there
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
 
 
+class PassedLight(NamedTuple):
+    """Light that came straight through surfaces.
+
+    Attributes
+    ----------
+    elements : (m,) int64
+        Of those that were asked for, ascending: all others have none.
+    values : (m, k) float32
+        By how many surfaces it met, 1 to k, where light is told apart by these; else k is 1.
+    """
+
+    elements: NDArray[np.int64]
+    values: NDArray[np.float32]
+
+
 class _Passed(NamedTuple):
     """Light that comes straight through surfaces.
 
@@ -170,7 +185,7 @@ class DirectSolver:
 
     def partly_passed(
         self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
-    ) -> NDArray[np.float32]:
+    ) -> PassedLight:
         """Unit-albedo transport of listed elements that surfaces let through, but for what counts as seen (``trace``).
 
         Parameters
@@ -178,14 +193,9 @@ class DirectSolver:
         point_ids, texel_ids : (n,) integers
         seed : int, optional
             Texel basis: another seed gives an independent estimate.
-
-        Returns
-        -------
-        (n, k) float32
-            By how many surfaces it met, 1 to k, where light is told apart by these; else k is 1.
         """
         depths = max(self.problem.depths_apart, 1)
-        result = np.zeros((len(point_ids), depths), np.float32)
+        found, values = [np.zeros(0, np.int64)], [np.zeros((0, depths), np.float32)]
         size = LANES // (4 * self.rays_per_element)
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
@@ -206,8 +216,13 @@ class DirectSolver:
                 for one in (apart if self.problem.depths_apart else [value])
             ]
             dr.eval(sums)
-            result[part] = np.stack([one.numpy() for one in sums], axis=1)
-        return result * (self.lighting.solid_angles[texel_ids] / np.float32(np.pi))[:, None]
+            index = dr.compress(sum(sums[1:], sums[0]) > 0)  # few
+            if len(index):
+                found.append(a + index.numpy().astype(np.int64))
+                values.append(np.stack([dr.gather(mi.Float, one, index).numpy() for one in sums], axis=1))
+        elements = np.concatenate(found)
+        power = self.lighting.solid_angles[np.asarray(texel_ids)[elements]] / np.float32(np.pi)
+        return PassedLight(elements, np.concatenate(values) * power[:, None])
 
     @dr.syntax
     def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:

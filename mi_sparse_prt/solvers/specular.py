@@ -20,7 +20,7 @@ from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.operators.sparse_rows import SparseRows
-from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, SpecularChains
 
@@ -207,7 +207,7 @@ class _Arriving:
             here, some = self._ids[lit[first:last]], self._cells.take(part)
             some = some._replace(rows=np.searchsorted(lit[first:last], some.rows))
             sky = self._chains.gather_sky(here, some, strata[part], seed)
-            found.append([scipy.sparse.csr_array(channel) for channel in sky.light])
+            found.append(sky.light)
             squares.append(sky.squares)
             first = last
         channels = [scipy.sparse.vstack(blocks, format="csr") for blocks in zip(*found, strict=True)]
@@ -236,22 +236,22 @@ def _passing(
         nonlocal traced
         solver, halves = DirectSolver(problem, strata), []
         for seed in seeds[-2:]:
-            values = solver.partly_passed(ids[rows], texels, seed)
-            halves.append([_side_by_side(values, rows, texels, found.shape)] * 3)
+            passed = solver.partly_passed(ids[rows], texels, seed)
+            halves.append([_side_by_side(passed, rows, texels, found.shape)] * 3)
         traced += 2 * len(rows) * strata**2
         return _compared(halves, power, traced)
 
     return _refined(sampled, options.strata, limit)
 
 
-def _side_by_side(values: Floats, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
-    """Light (m, k) of elements, told apart by depth, as a matrix (n, k * n_directions)."""
-    depths = values.shape[1]
-    columns = texels[:, None] + np.arange(depths) * (shape[1] // depths)
-    place = np.repeat(rows, depths), columns.ravel()
-    found = scipy.sparse.coo_array((values.ravel(), place), shape=shape).tocsr()
-    found.eliminate_zeros()
-    return found
+def _side_by_side(passed: PassedLight, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
+    """Light of some of listed elements, told apart by depth, as a matrix (n, k * n_directions)."""
+    element, depth = np.nonzero(passed.values)
+    which = passed.elements[element]
+    columns = texels[which] + depth * (shape[1] // passed.values.shape[1])
+    return scipy.sparse.coo_array(
+        (passed.values[element, depth], (rows[which], columns)), shape=shape
+    ).tocsr()
 
 
 def _with_neighbours(found: Sparse, problem: Problem) -> tuple[Ids, Ids]:
@@ -304,8 +304,6 @@ def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
     for a in range(0, len(ids), max(1, LANES // size)):
         some = np.asarray(ids[a : a + max(1, LANES // size)])
         place = np.repeat(some, size), np.tile(np.arange(size), len(some))
-        values = direct.partly_passed(*place)
-        kept = np.flatnonzero(values.any(axis=1))
-        rows = np.repeat(np.arange(len(some)), size)[kept]
-        blocks.append(_side_by_side(values[kept], rows, place[1][kept], (len(some), size * depths)))
+        passed, rows = direct.partly_passed(*place), np.repeat(np.arange(len(some)), size)
+        blocks.append(_side_by_side(passed, rows, place[1], (len(some), size * depths)))
     return scipy.sparse.vstack(blocks, format="csr")

@@ -57,14 +57,14 @@ class SkyLight(NamedTuple):
 
     Attributes
     ----------
-    light : (3, n, k * n_directions) float32
+    light : three (n, k * n_directions) sparse float32
         Unit-albedo transport of points: side by side that of light which met 1, 2, ... k surfaces, where it is told
         apart by these; else k is 1.
     squares : (m,) float32
         Of the weights of rays that left the scene, summed over those of each cell.
     """
 
-    light: NDArray[np.float32]
+    light: list[Sparse]
     squares: NDArray[np.float32]
 
 
@@ -141,9 +141,7 @@ class SpecularChains:
             square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
             dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid)
         dr.eval(*sums, squares)
-        shape = len(ids), columns
-        light = np.stack([(total.numpy() / np.float32(FIXED_POINT)).reshape(shape) for total in sums])
-        return SkyLight(light, squares.numpy() / np.float32(2**16))
+        return SkyLight(_compressed(sums, (len(ids), columns)), squares.numpy() / np.float32(2**16))
 
     def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> list[Sparse]:
         """What cosine-distributed rays from some points find after 1, 2, ... specular surfaces, by vertices (n, n_v).
@@ -246,6 +244,20 @@ class SpecularChains:
         sample, weight = si.bsdf().sample(single, si, u, v, active & ~rough)
         every, its = si.bsdf().sample(mi.BSDFContext(), si, u, v, active & rough)
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
+
+
+def _compressed(sums: list[mi.UInt32], shape: tuple[int, int]) -> list[Sparse]:
+    """Matrices of fixed-point numbers on the device, of which few are not 0."""
+    index = dr.compress((sums[0] | sums[1] | sums[2]) != 0)
+    values = [dr.gather(mi.UInt32, total, index) for total in sums] if len(index) else [mi.UInt32()] * 3
+    dr.eval(values)
+    place = index.numpy().astype(np.int64)
+    starts = np.searchsorted(place, np.arange(shape[0] + 1) * shape[1])
+    columns = (place % shape[1]).astype(np.int32)
+    return [
+        scipy.sparse.csr_array((v.numpy() / np.float32(FIXED_POINT), columns, starts), shape=shape)
+        for v in values
+    ]
 
 
 def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> list[Sparse]:
