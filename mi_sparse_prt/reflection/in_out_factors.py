@@ -131,7 +131,12 @@ class InOutFactors(Reflection):
     def attributes(self) -> dict[str, Any]:
         return {
             "factors": [
-                {"heights": f.grid.heights, "azimuths": f.grid.azimuths, "varying_diffuse": f.varying_diffuse}
+                {
+                    "heights": f.grid.heights,
+                    "azimuths": f.grid.azimuths,
+                    "varying_diffuse": f.varying_diffuse,
+                    "followed": f.followed,
+                }
                 for f in self.factors
             ],
             "harmonics": self.harmonics,
@@ -165,4 +170,5 @@ def _read_factors(number: int, known: dict[str, Any], arrays: dict[str, NDArray[
         or channels not in (1, 3)
     ):
         raise ValueError(f"factors of BRDF {number} do not fit together")
-    return BrdfFactors(grid, diffuse, incident, outgoing, bool(known["varying_diffuse"]))
+    flags = bool(known["varying_diffuse"]), bool(known.get("followed", False))
+    return BrdfFactors(grid, diffuse, incident, outgoing, *flags)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import drjit as dr
@@ -76,8 +77,8 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
     """What vertices do with incident light, with as many in-out factors as images need.
 
     Delta lobes have none: what a camera's ray sees by way of mirrors and glass, it sees by going on. Surfaces that
-    cannot be factored are left as diffuse, and followed by cameras (``relighting.followed_rays``). One warning names
-    them, and those whose factors miss the bound.
+    cannot be factored are left as diffuse, and followed by cameras (``relighting.followed_rays``). So are those whose
+    factors miss the bound, which keep as many as light between surfaces needs. One warning names both.
 
     Parameters
     ----------
@@ -128,6 +129,8 @@ class _Choice:
             return None
         if error > self._bound:
             self._off.append(f"{shapes} ({kind}, {error:.1%})")
+            few, _ = factors_for_images(material.bsdf, names[0], TOO_NARROW)
+            return replace(few, followed=True)
         return found
 
     def warn(self) -> None:
@@ -140,8 +143,8 @@ class _Choice:
             )
         if self._off:
             said.append(
-                f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect, which the estimated "
-                f"error does not know: {', '.join(self._off)}"
+                f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect: cameras' rays go on "
+                f"there, others receive light of fewer factors: {', '.join(self._off)}"
             )
         if said:
             warnings.warn("; ".join(said), PrtWarning, stacklevel=4)

@@ -49,6 +49,8 @@ class BrdfFactors:
     varying_diffuse : bool
         The diffuse part varies over the surface and is not in here: ``diffuse_reflectance`` tells it for places, in
         three channels, also where these factors have one.
+    followed : bool
+        They serve light between surfaces alone; what cameras see takes more of them than there are, and rays go on.
     """
 
     grid: DirectionGrid
@@ -56,6 +58,7 @@ class BrdfFactors:
     incident: Floats
     outgoing: Floats
     varying_diffuse: bool = False
+    followed: bool = False
 
     @property
     def terms(self) -> int:
