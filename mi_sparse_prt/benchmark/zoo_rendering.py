@@ -58,7 +58,7 @@ class ZooEffort:
 
     resolution: int = 16
     target_error: float = 0.05
-    spp: int = 64
+    spp: int = 256
     pass_spp: int = 128
     passes: int = 16
     noise: float = 0.005
