@@ -7,7 +7,6 @@ goes straight through (masks, thin panes, ``null``) needs no random rays: see ``
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -27,6 +26,7 @@ from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, Specular
 DIRECT = 1 / 3  # of the squared norm of light that nothing blocks: a guess of what direct light has
 SPECULAR = 7  # spawn key
 ROUNDS = 3  # after the first rays
+STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 Doubles = NDArray[np.float64]
@@ -137,9 +137,9 @@ def specular_light(
     limit = _Limit(share, share * DIRECT * _unblocked(problem, power))
     found = []
     if problem.scene.bends_light:
-        found.append(_Arriving(problem, every, power, seeds).refined(options, limit))
+        found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
     if problem.scene.passes_straight:
-        found.append(_passing(problem, every, power, seeds, options, limit))
+        found.append(_Passing(problem, every, power, seeds[32:]).refined(options, limit))
     halves = [half for estimate in found for half in estimate.halves]
     mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
@@ -222,26 +222,68 @@ def _spread(matrix: Sparse, rows: Ids, shape: tuple[int, int]) -> Sparse:
     return scipy.sparse.csr_array((matrix.data, matrix.indices, starts), shape=shape)
 
 
-def _passing(
-    problem: Problem, ids: Ids, power: Doubles, seeds: list[int], options: SpecularOptions, limit: _Limit
-) -> _Estimate:
-    """Light that goes straight through surfaces that take a part of it, twice where it is random."""
-    first = DirectSolver(problem, max(1, FINE // problem.emission.resolution), seeds[-3])
-    found, traced = passed_light(first, ids), len(ids) * problem.emission.size * first.rays_per_element
-    if problem.basis == "direction":
-        return _compared([[found] * 3] * 2, power, traced)
-    rows, texels = _with_neighbours(found, problem)
+class _Passing:
+    """Light that goes straight through surfaces that take a part of it."""
 
-    def sampled(strata: int) -> _Estimate:
-        nonlocal traced
-        solver, halves = DirectSolver(problem, strata), []
-        for seed in seeds[-2:]:
-            passed = solver.partly_passed(ids[rows], texels, seed)
-            halves.append([_side_by_side(passed, rows, texels, found.shape)] * 3)
-        traced += 2 * len(rows) * strata**2
-        return _compared(halves, power, traced)
+    def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
+        self._problem, self._ids, self._power, self._seeds = problem, ids, power, iter(seeds)
+        first = DirectSolver(problem, max(1, FINE // problem.emission.resolution), next(self._seeds))
+        self._found = passed_light(first, ids)
+        self._rays = len(ids) * problem.emission.size * first.rays_per_element
+        self._rows, self._texels = _with_neighbours(self._found, problem)
 
-    return _refined(sampled, options.strata, limit)
+    def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
+        """As many strata in each texel as the noise asks for; none is random in the direction basis.
+
+        Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
+        least where strata are in proportion to the fifth root of each texel's own, which two first halves tell,
+        averaged with those of its neighbours.
+        """
+        if self._problem.basis == "direction":
+            return _compared([[self._found] * 3] * 2, self._power, self._rays)
+        strata = np.full(len(self._rows), options.strata)
+        found, squares = self._sampled(strata)
+        if found.noise <= limit.of(found.square) or options.strata >= STRATA[-1]:
+            return found
+        near = self._averaged(squares)
+        wanted = 0.9 * max(limit.of(found.square), 1e-30)
+        for _ in range(ROUNDS):
+            scale = options.strata * (float((near**0.4).sum()) / wanted) ** (1 / 3)
+            between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
+            strata = np.maximum(np.array(STRATA)[np.searchsorted(between, scale * near**0.2)], options.strata)
+            found, _ = self._sampled(strata)
+            if found.noise <= limit.of(found.square) or strata.min(initial=STRATA[-1]) == STRATA[-1]:
+                break
+            wanted /= max(found.noise / max(limit.of(found.square), 1e-30), 1.2)
+        return found
+
+    def _averaged(self, squares: Doubles) -> Doubles:
+        """Squared noise of each element, averaged with its neighbours on the cubemap and one average element."""
+        shape = len(self._ids), self._problem.emission.size
+        noise = scipy.sparse.coo_array((squares, (self._rows, self._texels)), shape=shape).tocsr()
+        beside = _beside(self._problem)
+        total = scipy.sparse.csr_array(noise @ beside)[self._rows, self._texels]
+        return (np.asarray(total).ravel() + squares.mean()) / (np.diff(beside.indptr)[self._texels] + 1)
+
+    def _sampled(self, strata: NDArray[np.int64]) -> tuple[_Estimate, Doubles]:
+        """Light through strata of each texel, twice; and the squared noise of each element."""
+        depths, shape = max(self._problem.depths_apart, 1), self._found.shape
+        values = [np.zeros((len(strata), depths), np.float32) for _ in "ab"]
+        for own in np.unique(strata):
+            which = np.flatnonzero(strata == own)
+            solver = DirectSolver(self._problem, int(own))
+            for half in values:
+                passed = solver.partly_passed(
+                    self._ids[self._rows[which]], self._texels[which], next(self._seeds)
+                )
+                half[which[passed.elements]] = passed.values
+        every = np.arange(len(strata))
+        halves = [
+            [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] * 3 for half in values
+        ]
+        self._rays += 2 * int((strata**2).sum())
+        spread = np.square(values[0] - values[1], dtype=np.float64).sum(axis=1) / 4
+        return _compared(halves, self._power, self._rays), spread * self._power.max(axis=1)[self._rows]
 
 
 def _side_by_side(passed: PassedLight, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
@@ -259,24 +301,18 @@ def _with_neighbours(found: Sparse, problem: Problem) -> tuple[Ids, Ids]:
     place = found.tocoo()
     at = place.row, place.col % problem.emission.size
     found = scipy.sparse.coo_array((place.data, at), shape=(found.shape[0], problem.emission.size)).tocsr()
-    beside = problem.emission.sides.tables.beside
-    texel = np.repeat(np.arange(len(beside)), beside.shape[1])
-    ones = np.ones(beside.size + len(beside), np.float32)
-    near = np.append(texel, np.arange(len(beside))), np.append(beside.ravel(), np.arange(len(beside)))
-    grown = scipy.sparse.csr_array(found @ scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2))
+    grown = scipy.sparse.csr_array(found @ _beside(problem))
     rows, texels = grown.tocoo().coords
     return rows.astype(np.int64), texels.astype(np.int64)
 
 
-def _refined(sample: Callable[[int], _Estimate], strata: int, limit: _Limit, last: int = 8) -> _Estimate:
-    """Sample with more strata each time, until the noise is small enough."""
-    found = sample(strata)
-    while found.noise > limit.of(found.square) and strata < last:
-        # squared noise of strata falls as strata**-3 at the edges of light, of which there are as many as strata
-        factor = (found.noise / max(limit.of(found.square), 1e-30)) ** (1 / 3)
-        strata = min(last, max(strata + 1, int(np.ceil(strata * min(factor, 3)))))
-        found = sample(strata)
-    return found
+def _beside(problem: Problem) -> Sparse:
+    """Which texels (n_directions, n_directions) are the same, or beside each other on the cubemap: ones."""
+    beside = problem.emission.sides.tables.beside
+    texel = np.repeat(np.arange(len(beside)), beside.shape[1])
+    ones = np.ones(beside.size + len(beside), np.float32)
+    near = np.append(texel, np.arange(len(beside))), np.append(beside.ravel(), np.arange(len(beside)))
+    return scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2).tocsr()
 
 
 def _compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> _Estimate:
