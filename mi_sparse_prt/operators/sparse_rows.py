@@ -57,6 +57,12 @@ class SparseRows(Operator):
     def columns(self, ids: Ids) -> Floats:
         return np.stack([matrix[:, np.asarray(ids)].toarray() for matrix in self.matrices], axis=-1)
 
+    def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
+        width = signs.shape[1]
+        weights = np.zeros((self.shape[1], width), np.float32)
+        weights[words[:, None] * width + np.arange(width), np.arange(width)] = signs
+        return np.asarray(self.matrices[0] @ weights)
+
     def _apply(self, x: Floats) -> Floats:
         return np.stack([matrix @ x[:, c] for c, matrix in enumerate(self.matrices)], axis=1)
 

@@ -48,6 +48,9 @@ class Sum(Operator):
     def relight(self, lighting: Floats) -> Floats:
         return add(term.relight(lighting) for term in self.terms)
 
+    def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
+        return reduce(np.add, (term.combined(words, signs) for term in self.terms))
+
     def apply(self, x: Floats) -> Floats:
         return _add_channels([term.apply(x) for term in self.terms])
 
