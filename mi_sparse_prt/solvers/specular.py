@@ -7,6 +7,7 @@ goes straight through (masks, thin panes, ``null``) needs no random rays: see ``
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -23,9 +24,9 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, SpecularChains
 
-DIRECT = 1 / 3  # of the squared norm of light that nothing blocks: a guess of what direct light has
+SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
-ROUNDS = 3  # after the first rays
+ROUNDS = 3  # after the first
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 SUMS = 1 << 24  # elements at a time in which light is added up: 64 MB for each channel
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
@@ -135,7 +136,7 @@ def specular_light(
     power = np.square(problem.reflection.albedo[every].astype(np.float64))
     parts = int(problem.scene.bends_light) + int(problem.scene.passes_straight)
     share = options.error**2 / max(parts, 1)
-    limit = _Limit(share, share * DIRECT * _unblocked(problem, power))
+    limit = _Limit(share, share * _direct_norm(problem, every, power, seeds[-1]))
     found = []
     if problem.scene.bends_light:
         found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
@@ -159,31 +160,24 @@ class _Arriving:
         self._cells = self._chains.find_cells(ids, next(self._seeds))
 
     def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
-        """As many strata as the noise asks for.
-
-        The first rays, as many into each cell, say where light comes from; they are not among those that are kept then,
-        so that a cell of which they happened to find much light counts no more than another.
-        """
+        """As many strata as the noise asks for; the first ones, as many in each cell, say where light comes from."""
         strata = np.full(len(self._cells.rows), options.first)
-        found, squares = self._sampled(strata)
-        rays = len(self._ids) * CELLS**2 + found.rays
-        if found.noise <= limit.of(found.square) or options.first >= options.last:
-            return found._replace(rays=rays)
+        first, squares = self._sampled(strata)
+        first = first._replace(rays=len(self._ids) * CELLS**2 + first.rays)
+        if options.first >= options.last:
+            return first
         n = 2 * options.first**2
         # moments of weights, as if there were one average ray more; numbers of rays are proportional to their roots
         second = (squares + squares.mean() / n) / (n + 1)
         best = np.sqrt(second * self._power.max(axis=1)[self._cells.rows])
-        noise_of_one = found.noise * (n / 2) * best.sum() / (best**2).sum()
-        wanted = 0.9 * max(limit.of(found.square), 1e-30)
-        for _ in range(ROUNDS):
+        noise_of_one = first.noise * (n / 2) * best.sum() / max((best**2).sum(), 1e-300)
+
+        def sample(wanted: float) -> tuple[_Estimate, bool]:
             across = np.rint(np.sqrt(best * (noise_of_one / wanted)))
             strata = np.clip(across, 1, options.last).astype(np.int64)
-            found, _ = self._sampled(strata)
-            rays += found.rays
-            if found.noise <= limit.of(found.square) or strata.min() == options.last:
-                break
-            wanted /= max(found.noise / max(limit.of(found.square), 1e-30), 1.2)
-        return found._replace(rays=rays)
+            return self._sampled(strata)[0], bool((strata == options.last).all())
+
+        return _until_good(first, sample, limit)
 
     def _sampled(self, strata: NDArray[np.int64]) -> tuple[_Estimate, NDArray[np.float64]]:
         """Light from rays into cells, twice; and the squared weights of rays of each cell, summed."""
@@ -243,20 +237,18 @@ class _Passing:
         if self._problem.basis == "direction":
             return _compared([[self._found] * 3] * 2, self._power, self._rays)
         strata = np.full(len(self._rows), options.strata)
-        found, squares = self._sampled(strata)
-        if found.noise <= limit.of(found.square) or options.strata >= STRATA[-1]:
-            return found
-        near = self._averaged(squares)
-        wanted = 0.9 * max(limit.of(found.square), 1e-30)
-        for _ in range(ROUNDS):
-            scale = options.strata * (float((near**0.4).sum()) / wanted) ** (1 / 3)
-            between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
-            strata = np.maximum(np.array(STRATA)[np.searchsorted(between, scale * near**0.2)], options.strata)
-            found, _ = self._sampled(strata)
-            if found.noise <= limit.of(found.square) or strata.min(initial=STRATA[-1]) == STRATA[-1]:
-                break
-            wanted /= max(found.noise / max(limit.of(found.square), 1e-30), 1.2)
-        return found
+        first, squares = self._sampled(strata)
+        if options.strata >= STRATA[-1]:
+            return first
+        law = self._averaged(squares) * options.strata**3
+        between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
+
+        def sample(wanted: float) -> tuple[_Estimate, bool]:
+            scale = (float((law**0.4).sum()) / wanted) ** (1 / 3)
+            strata = np.array(STRATA)[np.searchsorted(between, scale * law**0.2)]
+            return self._sampled(strata)[0], bool((strata == STRATA[-1]).all())
+
+        return _until_good(first, sample, limit)
 
     def _averaged(self, squares: Doubles) -> Doubles:
         """Squared noise of each element, averaged with its neighbours on the cubemap and one average element."""
@@ -282,9 +274,9 @@ class _Passing:
         halves = [
             [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] * 3 for half in values
         ]
-        self._rays += 2 * int((strata**2).sum())
+        traced, self._rays = self._rays + 2 * int((strata**2).sum()), 0
         spread = np.square(values[0] - values[1], dtype=np.float64).sum(axis=1) / 4
-        return _compared(halves, self._power, self._rays), spread * self._power.max(axis=1)[self._rows]
+        return _compared(halves, self._power, traced), spread * self._power.max(axis=1)[self._rows]
 
 
 def _side_by_side(passed: PassedLight, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
@@ -316,6 +308,43 @@ def _beside(problem: Problem) -> Sparse:
     return scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2).tocsr()
 
 
+def _until_good(
+    first: _Estimate, sample: Callable[[float], tuple[_Estimate, bool]], limit: _Limit
+) -> _Estimate:
+    """The mean of estimates, one more until the noise is small enough; each counts by how little noise it has.
+
+    Where rays of a later one go depends on those before it, what they find on average does not.
+
+    Parameters
+    ----------
+    first : _Estimate
+    sample : callable
+        Another estimate, of as much squared noise as it is asked for, about, and whether it is as fine as can be.
+    limit : _Limit
+    """
+    total, trust, finest = first, 1.0, False
+    for _ in range(ROUNDS):
+        bound = limit.of(total.square)
+        if total.noise <= bound or finest:
+            break
+        wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / total.noise)
+        found, finest = sample(wanted * trust)
+        trust *= min(wanted / max(found.noise, 1e-300), 1)
+        total = _mean_of(total, found)
+    return total
+
+
+def _mean_of(a: _Estimate, b: _Estimate) -> _Estimate:
+    """Of independent estimates, in proportion to how precise they are."""
+    share = a.noise / max(a.noise + b.noise, 1e-300)  # of the second
+    halves = [
+        [x * np.float32(1 - share) + y * np.float32(share) for x, y in zip(*pair, strict=True)]
+        for pair in zip(a.halves, b.halves, strict=True)
+    ]
+    square = (1 - share) * a.square + share * b.square
+    return _Estimate(halves, square, share * b.noise, a.rays + b.rays)
+
+
 def _compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> _Estimate:
     """With the squared norm of radiance, and of the noise in the mean of the two halves."""
     square, noise = 0.0, 0.0
@@ -325,10 +354,14 @@ def _compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> _Estimat
     return _Estimate(halves, max(square, 0.0), noise, rays)
 
 
-def _unblocked(problem: Problem, power: Doubles) -> float:
-    """Squared norm of radiance under light that nothing blocks: the mean square of a cosine is a sixth."""
-    weights = float(np.square(problem.emission.solid_angles.astype(np.float64) / np.pi).sum())
-    return weights / 6 * float(power.sum())
+def _direct_norm(problem: Problem, ids: Ids, power: Doubles, seed: int) -> float:
+    """Squared norm of the radiance of direct light, about: from some of the points."""
+    some = np.random.default_rng(seed).permutation(len(ids))[:SAMPLE]
+    size = problem.emission.size
+    place = np.repeat(ids[some], size), np.tile(np.arange(size), len(some))
+    light = DirectSolver(problem, 1, seed).elements(*place).astype(np.float64)
+    squares = np.square(light).reshape(len(some), size).sum(axis=1)
+    return float(squares @ power[some].sum(axis=1)) * len(ids) / max(len(some), 1)
 
 
 def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
