@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
@@ -196,8 +198,8 @@ class _Attempts:
             expected = self._forecast()
         if run.progress:
             tqdm.write(_expectation(problem, expected))
-        parts = self._evaluated(first)
-        transport, plan = matrix_of(problem, parts), self._proposals.plan
+        parts, plan = self._evaluated(first)
+        transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
             error = held_out_error(self._judged, transport, run.seed)
         _warn_if_missed(error, self._settings, self._proposals.too_long)
@@ -228,25 +230,29 @@ class _Attempts:
         proposals.choose_again(how, found.total)
         return [parts]
 
-    def _evaluated(self, before: list[MethodResult]) -> MethodResult:
-        """The last of the attempts.
+    def _evaluated(self, before: list[MethodResult]) -> tuple[MethodResult, Plan]:
+        """The best of the attempts, and its plan.
 
         Each is judged by held-out elements of its own; those of the report decide nothing. What was evaluated before
         counts as well.
         """
         proposals, target, attempts = self._proposals, self._settings.target_error, list(before)
         attempts.append(self._execution.parts(proposals.plan))
+        plans, errors = [proposals.plan] * len(attempts), [math.inf] * len(before)
         while target is not None:
             with self._run.clock.phase("held_out"):
                 transport = matrix_of(self._problem, attempts[-1])
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
                 found = held_out_error(self._judged, transport, stream, target).total
+            errors.append(found)
             if found <= target or not proposals.after(found):
                 break
             if self._run.progress:
                 tqdm.write(_again(found, proposals.plan, proposals.seconds))
             attempts.append(self._execution.parts(proposals.plan))
-        return _with_costs_of(attempts)
+            plans.append(proposals.plan)
+        best = int(np.argmin(errors)) if target is not None else -1
+        return _with_costs_of(attempts, best), plans[best]
 
 
 def _of_scene(measurement: Measurement, scene: Scene) -> Measurement:
@@ -362,8 +368,8 @@ def _proposals(
     return CandidatePlans(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
 
 
-def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
-    """The last attempt, with what all of them evaluated; repeated elements count again."""
+def _with_costs_of(attempts: list[MethodResult], which: int) -> MethodResult:
+    """One of the attempts, with what all of them evaluated; repeated elements count again."""
 
     def total(name: str) -> dict[str, int]:
         accounts = [getattr(parts, name) for parts in attempts]
@@ -372,7 +378,7 @@ def _with_costs_of(attempts: list[MethodResult]) -> MethodResult:
         }
 
     return replace(
-        attempts[-1],
+        attempts[which],
         elements_evaluated=sum(parts.elements_evaluated for parts in attempts),
         elements=total("elements"),
         rays=total("rays"),

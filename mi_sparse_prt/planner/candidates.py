@@ -95,7 +95,7 @@ class CandidatePlans:
         begin = choose_first if settings.method == "auto" else choose
         within = [p for p in self._plans if p.seconds <= self._limit] or self._plans[:1]
         self._best = begin(within, target)
-        self._tried = [self._best]
+        self._tried, self._found = [self._best], list[tuple[Plan, float]]()
         wished, aim = choose(self._plans, target or TARGET), target or TARGET
         self.too_long = wished if wished.error <= aim < min(p.error for p in within) else None
 
@@ -124,12 +124,16 @@ class CandidatePlans:
     def after(self, error: float) -> bool:
         """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
 
-        Where what would meet the target takes too long, the next one is at least clearly more exact.
+        Where what would meet the target takes too long, the next one is at least clearly more exact. Where more rays
+        did not help and would not, plans that differ by these alone are left out.
         """
         settings, target = self._settings, self._settings.target_error
         if target is None or len(self._tried) == ATTEMPTS:
             return False
+        self._found.append((self._best.plan, error))
         plans = finer(self._costs, self._best, error, target, settings.spp)
+        if error_without_noise(self._found) > target:
+            plans = [p for p in plans if (p.plan.direct, p.plan.indirect) != _kind(self._best.plan)]
         self._costs = learned(self._costs, self._best.plan, error)
         budget = min(TIME_BUDGET * self._tried[0].seconds, self._limit - sum(p.seconds for p in self._tried))
         found = choose(plans, target) if plans else None
@@ -148,6 +152,26 @@ class CandidatePlans:
         unique = {p.plan: p for p in self._plans}.values()
         tried = [p.plan for p in self._tried]
         return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
+
+
+def _kind(plan: Plan) -> tuple[str, str]:
+    return plan.direct, plan.indirect
+
+
+def error_without_noise(found: Sequence[tuple[Plan, float]]) -> float:
+    """What more rays would leave of the error of gathered light: from the last two plans of its kind; 0 of others.
+
+    The square of noise is in inverse proportion to rays, and the rest remains.
+    """
+    (plan, error), alike = (
+        found[-1],
+        [other for other in found[:-1] if _kind(other[0]) == _kind(found[-1][0])],
+    )
+    if plan.indirect != "gather" or not alike or alike[-1][0].rays >= plan.rays:
+        return 0.0
+    before, its_error = alike[-1]
+    rest = (plan.rays * error**2 - before.rays * its_error**2) / (plan.rays - before.rays)
+    return math.sqrt(max(rest, 0.0))
 
 
 def refinement_schedule(settings: Settings) -> RefinementSchedule:

@@ -1,5 +1,6 @@
 """Plans: what they refuse, what measured costs predict, and which one is chosen."""
 
+import importlib
 import json
 import math
 import re
@@ -13,12 +14,12 @@ from conftest import GREY, build, diffuse, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.run import Run
-from mi_sparse_prt.estimation.held_out import HeldOutError
+from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.candidates import CandidatePlans
+from mi_sparse_prt.planner.candidates import CandidatePlans, error_without_noise
 from mi_sparse_prt.planner.choice import (
     MARGIN,
     Costs,
@@ -500,3 +501,37 @@ def test_other_materials_are_gathered_from_as_well():
     assert costs.gather is not None
     assert costs.gather.error(4096, 0.008) > 0
     assert costs.paths is not None and costs.sparse is not None
+
+
+def test_more_rays_that_did_not_help_are_not_tried_again():
+    """
+    Scenario: two plans that gather, 64 and 256 rays per vertex, for a target of 2.5%. What 256 leave of squared noise is a quarter.
+    Expected: where 4.8% remain without noise, nothing follows that differs by rays alone; where 2% do, more rays do.
+    """
+    few, more = (Plan("exact", "gather", rays, 0.05) for rays in (64, 256))
+    for rest, noise, goes_on in ((0.048, 0.04, False), (0.02, 0.04, True)):
+        errors = np.hypot(rest, noise), np.hypot(rest, noise / 2)
+        assert error_without_noise([(few, errors[0])]) == 0
+        assert error_without_noise([(few, errors[0]), (more, errors[1])]) == pytest.approx(rest)
+        assert error_without_noise([(more, errors[0]), (few, errors[1])]) == 0
+        paths = PathCosts({32: 1e5}, {32: 0.3}, {32: 0.0})
+        ranking = CandidatePlans(Costs(0, EXACT, paths, FakeGather()), Settings(32, target_error=0.025))
+        ranking._best, ranking._found = replace(ranking._best, plan=more), [(few, errors[0])]
+        assert ranking.after(errors[1]) is goes_on
+
+
+def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
+    """Expected: if the second of two plans turns out worse, the matrix and its report are those of the first."""
+    lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3, 0.25, 0.25))
+
+    def judged(problem, transport, stream, target=None):
+        found = held_out_error(problem, transport, stream, target)
+        return found if target is None else replace(found, total=next(errors))
+
+    module = importlib.import_module("mi_sparse_prt.precompute")
+    monkeypatch.setattr(module, "held_out_error", judged)
+    with pytest.warns(prt.PrtWarning, match="was not met"):
+        found = prt.precompute(grey_scene, lighting, "gather", target_error=1e-4, progress=False)
+    assert next(errors, None) is None
+    assert found.report["plan"]["parameters"]["rays"] == 64
+    assert found.report["rays"]["gather"] > 64 * grey_scene.n_vertices
