@@ -505,7 +505,8 @@ def test_other_materials_are_gathered_from_as_well():
 
 def test_more_rays_that_did_not_help_are_not_tried_again():
     """
-    Scenario: two plans that gather, 64 and 256 rays per vertex, for a target of 2.5%. What 256 leave of squared noise is a quarter.
+    Scenario: two plans that gather, 64 and 256 rays per vertex, for a target of 2.5%; the latter have a quarter of the
+        squared noise.
     Expected: where 4.8% remain without noise, nothing follows that differs by rays alone; where 2% do, more rays do.
     """
     few, more = (Plan("exact", "gather", rays, 0.05) for rays in (64, 256))
