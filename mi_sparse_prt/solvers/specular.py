@@ -238,7 +238,7 @@ class _Passing:
             return _compared([[self._found] * 3] * 2, self._power, self._rays)
         strata = np.full(len(self._rows), options.strata)
         first, squares = self._sampled(strata)
-        if options.strata >= STRATA[-1]:
+        if not len(strata) or options.strata >= STRATA[-1]:
             return first
         law = self._averaged(squares) * options.strata**3
         between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])

@@ -162,6 +162,22 @@ def test_cut_outs_send_on_what_they_do_not_let_by():
         assert ours == pytest.approx(known, rel=0.02)
 
 
+def test_where_nothing_is_lost_on_the_way_nothing_is_sampled():
+    """A floor in a box of air, light not being told apart by depth: bits tell all of it, and there is no noise."""
+    shapes = {
+        "floor": {**FLOOR, "bsdf": diffuse(0.5, 0.5, 0.5)},
+        "air": {"type": "cube", "to_world": T().scale(2), "bsdf": {"type": "null"}},
+    }
+    scene, lighting = build(1.0, **shapes), prt.CubemapLighting(4)
+    problem = replace(problem_at(scene, lighting, basis="texel", max_depth=-1), specular_apart=True)
+    found = specular_light(problem, 0, SpecularOptions(error=1e-3))
+    assert found.noise == 0
+    assert not found.operator.rows(np.arange(scene.n_vertices)).any()
+    assert DirectSolver(problem, 2).elements(np.zeros(96, int), np.arange(96)).sum() == pytest.approx(
+        1, abs=0.02
+    )
+
+
 def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
     scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
