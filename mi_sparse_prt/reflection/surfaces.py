@@ -31,6 +31,7 @@ from mi_sparse_prt.scene.scene import Scene
 TOO_NARROW = (
     0.1  # error of images from which factors are left out, and cameras follow rays: a diffuse surface has 1
 )
+FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 NO_TANGENTS = (
     "shape '{}': its BSDF is anisotropic and it has no texture coordinates: Mitsuba then takes the first edge of each "
     "triangle for its tangent, which vertices cannot follow; give it texture coordinates"
@@ -78,7 +79,7 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
 
     Delta lobes have none: what a camera's ray sees by way of mirrors and glass, it sees by going on. Surfaces that
     cannot be factored are left as diffuse, and followed by cameras (``relighting.followed_rays``). So are those whose
-    factors miss the bound, which keep as many as light between surfaces needs. One warning names both.
+    factors miss twice the bound, which keep as many as light between surfaces needs. One warning names both.
 
     Parameters
     ----------
@@ -129,6 +130,7 @@ class _Choice:
             return None
         if error > self._bound:
             self._off.append(f"{shapes} ({kind}, {error:.1%})")
+        if error > FOLLOWED * self._bound:
             few, _ = factors_for_images(material.bsdf, names[0], TOO_NARROW)
             return replace(few, followed=True)
         return found
@@ -143,8 +145,8 @@ class _Choice:
             )
         if self._off:
             said.append(
-                f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect: cameras' rays go on "
-                f"there, others receive light of fewer factors: {', '.join(self._off)}"
+                f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect, which the estimated "
+                f"error does not know; where it is twice as much, cameras' rays go on: {', '.join(self._off)}"
             )
         if said:
             warnings.warn("; ".join(said), PrtWarning, stacklevel=4)
