@@ -183,7 +183,8 @@ class _Attempts:
                 specular = specular_light(self._problem, run.seed, settings.specular)
                 if self._problem.reflection.terms:
                     specular = with_term_rows(self._problem, specular, run.seed)
-        self._proposals = _proposals(direct, settings, self._dark is None, run.clock)
+        noise = 0.0 if specular is None else specular.error
+        self._proposals = _proposals(direct, settings, self._dark is None, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
         self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
 
@@ -243,12 +244,12 @@ class _Attempts:
             with self._run.clock.phase("held_out"):
                 transport = matrix_of(self._problem, attempts[-1])
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
-                found = held_out_error(self._judged, transport, stream, target).total
-            errors.append(found)
-            if found <= target or not proposals.after(found):
+                found = held_out_error(self._judged, transport, stream, target)
+            errors.append(found.total)
+            if found.total <= target or not proposals.after(found, self._run.clock.report()["total"]):
                 break
             if self._run.progress:
-                tqdm.write(_again(found, proposals.plan, proposals.seconds))
+                tqdm.write(_again(found.total, proposals.plan, proposals.seconds))
             attempts.append(self._execution.parts(proposals.plan))
             plans.append(proposals.plan)
         best = int(np.argmin(errors)) if target is not None else -1
@@ -356,16 +357,17 @@ def _skipped(scene: Scene, reason: str | None) -> list[str]:
 
 
 def _proposals(
-    direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
+    direct: DirectSolver, settings: Settings, indirect: bool, specular: float, clock: Stopwatch
 ) -> RefinementSchedule | CandidatePlans:
-    """The plans to try, measured and ranked where the method leaves them open."""
+    """The plans to try, measured and ranked where the method leaves them open; ``specular`` is an error of all."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
         settings = replace(settings, spp=None, indirect_resolution=None)
     elif settings.method != "auto" or settings.view_dependent or settings.measurement != "vertices":
         return refinement_schedule(settings)
     with clock.phase("plan"):
         costs = measure(direct, settings, indirect)
-    return CandidatePlans(replace(costs, fixed=costs.fixed + clock.report()["total"]), settings)
+    costs = replace(costs, fixed=costs.fixed + clock.report()["total"], specular=specular)
+    return CandidatePlans(costs, settings)
 
 
 def _with_costs_of(attempts: list[MethodResult], which: int) -> MethodResult:
@@ -424,7 +426,7 @@ def _expectation(problem: Problem, expected: Forecast) -> str:
 def _again(error: float, plan: Plan, seconds: float | None) -> str:
     values = ", ".join(f"{name} {value}" for name, value in plan.parameters.items())
     how = f"{plan.direct} direct light, {plan.indirect}" + (f" ({values})" if values else "")
-    time = "" if seconds is None else f": about {seconds:.0f} s in all by itself"
+    time = "" if seconds is None else f": about {seconds:.0f} s more"
     return f"the error is {error:.2%}, above the target; next, {how}{time}"
 
 

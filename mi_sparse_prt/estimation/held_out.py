@@ -81,6 +81,8 @@ class HeldOutError:
         one were.
     elements : int
         That were drawn.
+    parts : dict
+        What ``"direct"``, ``"indirect"`` and ``"specular"`` light add to `total`: their squares sum up to its square.
     terms : list of float
         Of glossy scenes: of each term's rows.
     """
@@ -89,6 +91,7 @@ class HeldOutError:
     meshes: dict[str, float]
     standard_error: dict[str, Any]
     elements: int
+    parts: dict[str, float]
     terms: list[float]
 
     def report(self) -> dict[str, Any]:
@@ -154,8 +157,18 @@ def estimate_errors(samples: Samples) -> HeldOutError:
         {name: value for name, (value, _) in meshes.items()},
         {"total": total[1], "meshes": {name: error for name, (_, error) in meshes.items()}},
         sum(len(sample.weights) for sample in samples.values()),
+        _shares(samples),
         [relative(glossy, row)[0] for row in range(2, rows)],
     )
+
+
+def _shares(samples: Samples) -> dict[str, float]:
+    """Relative L2 error that each part adds; 0 where its square is noise about 0."""
+    norm = sum(float(s.weights @ s.norms[:, 0]) for s in samples.values())
+    squares = dict.fromkeys((part for _, part in samples), 0.0)
+    for (_, part), s in samples.items():
+        squares[part] += float(s.weights @ s.squares[:, 0])
+    return {part: float(np.sqrt(max(square, 0.0) / max(norm, 1e-300))) for part, square in squares.items()}
 
 
 def _pooled(samples: Samples) -> list[Sample]:

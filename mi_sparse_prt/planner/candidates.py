@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import (
@@ -38,7 +39,7 @@ class RefinementSchedule:
     plan : Plan
         The present one.
     seconds : float or None
-        What it is predicted to take in all.
+        What it is predicted to take; where others came before, beside these.
     too_long : None
         See ``CandidatePlans``.
     """
@@ -49,8 +50,8 @@ class RefinementSchedule:
     def __init__(self, plans: Sequence[Plan]) -> None:
         self.plan, *self._others = plans
 
-    def after(self, error: float) -> bool:
-        """Go on to the next plan, the present one having this error; False if there is none."""
+    def after(self, found: HeldOutError, elapsed: float) -> bool:
+        """Go on to the next plan, the present one having this error after so many seconds in all; False if none is left."""
         if self._others:
             self.plan = self._others.pop(0)
             return True
@@ -106,7 +107,7 @@ class CandidatePlans:
 
     @property
     def seconds(self) -> float:
-        """What it is predicted to take in all."""
+        """What it is predicted to take, beside what came before it."""
         return self._best.seconds
 
     @property
@@ -121,30 +122,37 @@ class CandidatePlans:
         fixed = costs.fixed + costs.direct[direct].seconds
         self._rank(replace(costs, fixed=fixed, direct=costs.direct | {direct: found}))
 
-    def after(self, error: float) -> bool:
+    def after(self, found: HeldOutError, elapsed: float) -> bool:
         """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
 
-        Where what would meet the target takes too long, the next one is at least clearly more exact. Where more rays
-        did not help and would not, plans that differ by these alone are left out.
+        Where what would meet the target takes too long, or nothing would, the next one is at least clearly more exact,
+        and the quickest of those. Where more rays did not help and would not, plans that differ by these alone are
+        left out.
+
+        Parameters
+        ----------
+        found : HeldOutError
+        elapsed : float
+            Seconds since the beginning: in all, ``max_seconds`` are not to be exceeded.
         """
-        settings, target = self._settings, self._settings.target_error
+        settings, target, error = self._settings, self._settings.target_error, found.total
         if target is None or len(self._tried) == ATTEMPTS:
             return False
         self._found.append((self._best.plan, error))
+        self._costs = learned(self._costs, self._best.plan, found)
         plans = finer(self._costs, self._best, error, target, settings.spp)
         if error_without_noise(self._found) > target:
             plans = [p for p in plans if (p.plan.direct, p.plan.indirect) != _kind(self._best.plan)]
-        self._costs = learned(self._costs, self._best.plan, error)
-        budget = min(TIME_BUDGET * self._tried[0].seconds, self._limit - sum(p.seconds for p in self._tried))
-        found = choose(plans, target) if plans else None
-        if found is not None and found.seconds > budget:
-            self.too_long = found if found.error <= target else None
-            found = better(plans, error, budget)
-        if found is None:
+        budget = min(TIME_BUDGET * self._tried[0].seconds, self._limit - elapsed)
+        next_one = choose(plans, target) if plans else None
+        if next_one is not None and (next_one.seconds > budget or next_one.error > target):
+            self.too_long = next_one if next_one.error <= target else None
+            next_one = better(plans, error, budget)
+        if next_one is None:
             return False
-        self._best = found
-        self._plans.append(found)
-        self._tried.append(found)
+        self._best = next_one
+        self._plans.append(next_one)
+        self._tried.append(next_one)
         return True
 
     def report(self) -> list[dict[str, Any]]:

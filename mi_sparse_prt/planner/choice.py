@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from mi_sparse_prt.estimation.held_out import ROUND
+from mi_sparse_prt.estimation.held_out import ROUND, HeldOutError
 from mi_sparse_prt.methods.plan import DENSE, GATHER, Plan
 from mi_sparse_prt.methods.settings import TARGET
 from mi_sparse_prt.planner.direct_costs import DirectCost
@@ -48,6 +48,8 @@ class Costs:
         None where there is no indirect light, or where it cannot be found so.
     direct_share : float
         Norm of direct light relative to that of the whole matrix.
+    specular : float
+        Relative error that light by way of mirrors and glass adds to every plan.
     """
 
     fixed: float
@@ -57,6 +59,7 @@ class Costs:
     sparse: SparseCosts | None = None
     direct_share: float = 1.0
     check: float = 0.0
+    specular: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,9 +127,10 @@ def _rounds(error: float, target: float) -> float:
 def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[_Priced]:
     """All plans; what all have in common is left out."""
     for name, light in costs.direct.items():
-        room = math.sqrt(max((MARGIN * target) ** 2 - light.error**2, 0.0))
+        others = math.hypot(light.error, costs.specular)
+        room = math.sqrt(max((MARGIN * target) ** 2 - others**2, 0.0))
         for plan, seconds, error in _indirect(costs, name, room, spp):
-            yield _Priced(plan, light.seconds, seconds, math.hypot(light.error, error))
+            yield _Priced(plan, light.seconds, seconds, math.hypot(others, error))
     if costs.sparse is not None:
         for share in DENSE:
             plan = Plan("sparse", "sparse", dense=share, spp=costs.sparse.spp)
@@ -194,23 +198,31 @@ def finer(
 ) -> list[Predicted]:
     """Plans that are more exact than one whose error was found to be above the target, the quickest first.
 
-    Gathering is off by a bias, which the error tells; other predictions are taken to be all as far off. Errors are
-    those to expect now.
+    Parameters
+    ----------
+    costs : Costs
+        As ``learned`` after it.
+    missed : Predicted
+        Unless it gathered, other predictions are taken to be as far off as it was.
+    error, target : float
+    spp : int, optional
     """
-    if missed.plan.indirect == "gather":
-        plans = predictions(learned(costs, missed.plan, error), target, spp)
-    else:
-        off = error / max(missed.error, 1e-12)
-        plans = [replace(p, error=off * p.error) for p in predictions(costs, target / off, spp)]
+    off = 1.0 if missed.plan.indirect == "gather" else error / max(missed.error, 1e-12)
+    plans = [replace(p, error=off * p.error) for p in predictions(costs, target / off, spp)]
     return [p for p in plans if p.error < error and p.plan != missed.plan]
 
 
-def learned(costs: Costs, plan: Plan, error: float) -> Costs:
-    """Costs, after the error of a plan was found; only of gathering there is something to learn."""
+def learned(costs: Costs, plan: Plan, found: HeldOutError) -> Costs:
+    """Costs of what may follow a plan, its error being known; what was found once costs nothing again.
+
+    Gathering is off by a bias, which the error of indirect light tells.
+    """
+    costs = replace(costs, fixed=(1 + ROUND) * costs.check)
     if costs.gather is None or plan.indirect != "gather":
         return costs
-    indirect = math.sqrt(max(error**2 - costs.direct[plan.direct].error ** 2, 0.0))
-    return replace(costs, gather=costs.gather.learned(plan.rays, plan.tolerance, indirect))
+    gather = costs.gather.learned(plan.rays, plan.tolerance, found.parts["indirect"])
+    direct = costs.direct | {plan.direct: DirectCost(0.0, found.parts["direct"])}
+    return replace(costs, gather=gather, direct=direct, specular=found.parts.get("specular", 0.0))
 
 
 def better(plans: list[Predicted], error: float, seconds: float) -> Predicted | None:

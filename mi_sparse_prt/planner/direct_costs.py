@@ -25,6 +25,7 @@ PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
 INNER = 4  # one in so many vertices of a patch is judged: the middle ones, which have all their neighbours
 PATCHES_DRAWN = 3  # spawn key
+EDGES_TIMED = 16  # times the points of a pilot
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 
@@ -48,15 +49,16 @@ def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
 
 def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     """Texels' centres, and rays along edges of visibility, in the texel basis."""
-    problem = replace(direct.problem, basis="direction")
+    problem, count = replace(direct.problem, basis="direction"), len(held.vertices)
     centres = len(direct.points) * seconds_per_row(DirectSolver(problem))
-    some = DirectSolver(problem.at(points_at(direct.points, held.vertices)))
-    places = np.arange(len(held.vertices))
-    bits = some.rows(places).astype(np.uint32, copy=False)
+    # as often that one launch of a kernel is next to nothing, as it is for all points
+    some = DirectSolver(problem.at(points_at(direct.points, np.tile(held.vertices, EDGES_TIMED))))
+    places = np.arange(count)
+    bits = np.tile(some.rows(places).astype(np.uint32, copy=False), (EDGES_TIMED, 1))
     part, _ = fractional_visibility(some, bits)
     start = time.perf_counter()
     fractional_visibility(some, bits)
-    edges = (time.perf_counter() - start) * len(direct.points) / len(places)
+    edges = (time.perf_counter() - start) * len(direct.points) / len(bits)
     ours = part.elements(np.repeat(places, held.texels.shape[1]), held.texels.ravel())
     square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
     return DirectCost(centres + edges, math.sqrt(max(square, 0.0)))

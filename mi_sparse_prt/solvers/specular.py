@@ -70,6 +70,8 @@ class SpecularLight:
         k, or 0.
     noise : float
         Its relative L2 error, as estimated from two halves.
+    error : float
+        The same noise, relative to direct and specular light together.
     rays : int
         That were traced.
     """
@@ -77,6 +79,7 @@ class SpecularLight:
     matrices: tuple[Sparse, ...]
     depths_apart: int
     noise: float
+    error: float
     rays: int
 
     @cached_property
@@ -136,7 +139,8 @@ def specular_light(
     power = np.square(problem.reflection.albedo[every].astype(np.float64))
     parts = int(problem.scene.bends_light) + int(problem.scene.passes_straight)
     share = options.error**2 / max(parts, 1)
-    limit = _Limit(share, share * _direct_norm(problem, every, power, seeds[-1]))
+    direct = _direct_norm(problem, every, power, seeds[-1])
+    limit = _Limit(share, share * direct)
     found = []
     if problem.scene.bends_light:
         found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
@@ -148,7 +152,8 @@ def specular_light(
     matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
     square, noise = sum(part.square for part in found), sum(part.noise for part in found)
     rays = sum(part.rays for part in found)
-    return SpecularLight(matrices, problem.depths_apart, float(np.sqrt(noise / max(square, 1e-300))), rays)
+    own, all_of_it = (float(np.sqrt(noise / max(norm, 1e-300))) for norm in (square, square + direct))
+    return SpecularLight(matrices, problem.depths_apart, own, all_of_it, rays)
 
 
 class _Arriving:
