@@ -115,11 +115,19 @@ class Execution:
     def _edges(self) -> MethodResult:
         """All texels' centres, and where visibility changes between these."""
         solver = DirectSolver(replace(self._problem, basis="direction"))
-        centres = exact_direct(solver, self._run)
+        centres = self._centres(solver)
         assert isinstance(centres.direct, Visibility)
         with self._run.clock.phase("edges"):
             part, rays = fractional_visibility(solver, centres.direct.bits)
         return replace(centres, direct=part, rays={"direct": centres.rays["direct"] + rays})
+
+    def _centres(self, solver: DirectSolver) -> MethodResult:
+        """Which texels' centres are seen; rays that looked for light that surfaces let through may know."""
+        if self._specular is None or self._specular.seen is None:
+            return exact_direct(solver, self._run)
+        bits = Visibility(self._specular.seen, solver.points.normals, solver.lighting)
+        elements = len(solver.points) * solver.lighting.n_directions
+        return MethodResult(bits, None, elements, {"direct": elements, "indirect": 0}, {"direct": 0})
 
     def _gathered(self, plan: Plan, light: MethodResult) -> MethodResult:
         """With interreflections by finite elements."""

@@ -51,7 +51,7 @@ class RefinementSchedule:
         self.plan, *self._others = plans
 
     def after(self, found: HeldOutError, elapsed: float) -> bool:
-        """Go on to the next plan, the present one having this error after so many seconds in all; False if none is left."""
+        """Go on to the next plan, the present one having this error after so many seconds; False if none is left."""
         if self._others:
             self.plan = self._others.pop(0)
             return True

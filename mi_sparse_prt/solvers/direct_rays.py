@@ -101,22 +101,33 @@ class DirectSolver:
 
     def rows(self, point_ids: NDArray[np.integer]) -> NDArray[np.uint32] | NDArray[np.uint16]:
         """Trace whole rows and return them in stored form (see ``row_storage``)."""
+        if self.basis == "direction":
+            point, texel = self._of_rows(point_ids)
+            visible, _ = self.trace(point, self._texels.centre(texel), texel < self._n_texels)
+            return _packed(visible, texel).numpy().reshape(len(point_ids), -1)
         # one id more than rows: Dr.Jit would compile another kernel for an array of size one
         n, ids = len(point_ids), mi.UInt32(np.append(point_ids, point_ids[-1:]))
-        if self.basis == "direction":
-            lane = dr.arange(mi.UInt32, n * self._padded)
-            row = lane // self._padded
-            texel = lane - row * self._padded
-            point = dr.gather(mi.UInt32, ids, row)
-            visible, _ = self.trace(point, self._texels.centre(texel), texel < self._n_texels)
-            bits = dr.select(visible, mi.UInt32(1) << (texel & (BITS - 1)), 0)
-            return dr.block_reduce(dr.ReduceOp.Or, bits, BITS).numpy().reshape(n, -1)
         element, stratum = self._lanes(n * self._n_texels)
         row = element // self._n_texels
         texel = element - row * self._n_texels
         point = dr.gather(mi.UInt32, ids, row)
         mean = self._means(point, texel, stratum, lambda *_: [mi.Float(1)], self.seed)[0]
         return mi.UInt32(mean * FIXED_POINT + 0.5).numpy().astype(np.uint16).reshape(n, -1)
+
+    def rows_and_passed(self, point_ids: NDArray[np.integer]) -> tuple[NDArray[np.uint32], PassedLight]:
+        """Of texels' centres, bits (``rows``) and what surfaces let through (``partly_passed``), by the same rays."""
+        point, texel = self._of_rows(point_ids)
+        direction, active = self._texels.centre(texel), texel < self._n_texels
+        cosine = dr.dot(self._points.normal(point), direction)
+        active &= cosine > 0
+        passed = self._transmittance(start_ray(self._points, point, direction), active)
+        seen, apart = active & passed.whole, self._by_depth(passed, active & ~passed.whole, cosine)
+        dr.eval(seen, apart)  # at once: each reduction would trace the rays again
+        bits, (lanes, values) = _packed(seen, texel), _listed(apart)
+        row, column = np.divmod(lanes, self._padded)
+        power = self.lighting.solid_angles[column] / np.float32(np.pi)
+        found = PassedLight(row * self._n_texels + column, values * power[:, None])
+        return bits.numpy().reshape(len(point_ids), -1), found
 
     def elements(
         self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], seed: int | None = None
@@ -154,6 +165,14 @@ class DirectSolver:
             points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
             seen[part] = self.trace(points, self._texels.centre(texels), mi.Mask(True))[0].numpy()
         return seen
+
+    def _of_rows(self, point_ids: NDArray[np.integer]) -> tuple[mi.UInt32, mi.UInt32]:
+        """Point and texel of every lane; rows have some lanes more than texels."""
+        # one id more than rows: Dr.Jit would compile another kernel for an array of size one
+        n, ids = len(point_ids), mi.UInt32(np.append(point_ids, point_ids[-1:]))
+        lane = dr.arange(mi.UInt32, n * self._padded)
+        row = lane // self._padded
+        return dr.gather(mi.UInt32, ids, row), lane - row * self._padded
 
     def _lanes(self, n_elements: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Element and stratum of every lane, strata of an element side by side."""
@@ -209,20 +228,22 @@ class DirectSolver:
                 direction, area, total = self._inside(point, texel, stratum, own)
             cosine = dr.dot(self._points.normal(point), direction)
             passed = self._transmittance(start_ray(self._points, point, direction), cosine > 0)
-            value = dr.select((cosine > 0) & ~passed.whole, passed.share * cosine * area, 0)
-            apart = [dr.select(passed.surfaces == k + 1, value, 0) for k in range(depths)]
-            sums = [
-                dr.block_reduce(dr.ReduceOp.Add, one, self.rays_per_element) / total
-                for one in (apart if self.problem.depths_apart else [value])
-            ]
+            apart = self._by_depth(passed, (cosine > 0) & ~passed.whole, cosine * area)
+            dr.eval(apart)  # at once: each reduction would trace the rays again
+            sums = [dr.block_reduce(dr.ReduceOp.Add, one, self.rays_per_element) / total for one in apart]
             dr.eval(sums)
-            index = dr.compress(sum(sums[1:], sums[0]) > 0)  # few
-            if len(index):
-                found.append(a + index.numpy().astype(np.int64))
-                values.append(np.stack([dr.gather(mi.Float, one, index).numpy() for one in sums], axis=1))
+            places, some = _listed(sums)
+            found.append(a + places)
+            values.append(some)
         elements = np.concatenate(found)
         power = self.lighting.solid_angles[np.asarray(texel_ids)[elements]] / np.float32(np.pi)
         return PassedLight(elements, np.concatenate(values) * power[:, None])
+
+    def _by_depth(self, passed: _Passed, active: mi.Mask, weight: mi.Float) -> list[mi.Float]:
+        """Weighted light of rays, told apart by how many surfaces it met, or not."""
+        value = dr.select(active, passed.share * weight, 0)
+        depths = self.problem.depths_apart
+        return [dr.select(passed.surfaces == k + 1, value, 0) for k in range(depths)] if depths else [value]
 
     @dr.syntax
     def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:
@@ -291,3 +312,17 @@ class DirectSolver:
         v = (mi.Float(row) + rng.next_float32()) / self.strata
         direction, area = self._texels.inside(texel, u, v)
         return direction, area, dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)
+
+
+def _packed(seen: mi.Mask, texel: mi.UInt32) -> mi.UInt32:
+    """Bits of lanes, one word for as many as it has."""
+    return dr.block_reduce(dr.ReduceOp.Or, dr.select(seen, mi.UInt32(1) << (texel & (BITS - 1)), 0), BITS)
+
+
+def _listed(values: list[mi.Float]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Lanes (m,) in which evaluated values are not all 0, which are few, and these values (m, k)."""
+    index = dr.compress(sum(values[1:], values[0]) > 0)
+    if not len(index):
+        return np.zeros(0, np.int64), np.zeros((0, len(values)), np.float32)
+    some = np.stack([dr.gather(mi.Float, one, index).numpy() for one in values], axis=1)
+    return index.numpy().astype(np.int64), some

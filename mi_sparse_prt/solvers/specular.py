@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Ids
@@ -74,6 +75,8 @@ class SpecularLight:
         The same noise, relative to direct and specular light together.
     rays : int
         That were traced.
+    seen : (n, words) uint32 bits, optional
+        Which points see the centres of texels, if that was found on the way.
     """
 
     matrices: tuple[Sparse, ...]
@@ -81,6 +84,7 @@ class SpecularLight:
     noise: float
     error: float
     rays: int
+    seen: Bits | None = None
 
     @cached_property
     def operator(self) -> SparseRows | ByDepth:
@@ -141,11 +145,13 @@ def specular_light(
     share = options.error**2 / max(parts, 1)
     direct = _direct_norm(problem, every, power, seeds[-1])
     limit = _Limit(share, share * direct)
-    found = []
+    found, seen = [], None
     if problem.scene.bends_light:
         found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
     if problem.scene.passes_straight:
-        found.append(_Passing(problem, every, power, seeds[32:]).refined(options, limit))
+        passing = _Passing(problem, every, power, seeds[32:])
+        found.append(passing.refined(options, limit))
+        seen = passing.seen
     halves = [half for estimate in found for half in estimate.halves]
     mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
     grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
@@ -153,7 +159,7 @@ def specular_light(
     square, noise = sum(part.square for part in found), sum(part.noise for part in found)
     rays = sum(part.rays for part in found)
     own, all_of_it = (float(np.sqrt(noise / max(norm, 1e-300))) for norm in (square, square + direct))
-    return SpecularLight(matrices, problem.depths_apart, own, all_of_it, rays)
+    return SpecularLight(matrices, problem.depths_apart, own, all_of_it, rays, seen)
 
 
 class _Arriving:
@@ -227,9 +233,14 @@ class _Passing:
 
     def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
         self._problem, self._ids, self._power, self._seeds = problem, ids, power, iter(seeds)
-        first = DirectSolver(problem, max(1, FINE // problem.emission.resolution), next(self._seeds))
-        self._found = passed_light(first, ids)
-        self._rays = len(ids) * problem.emission.size * first.rays_per_element
+        strata = max(1, FINE // problem.emission.resolution)
+        #: Which points see the centres of texels, where rays are at these.
+        self.seen: Bits | None = None
+        if problem.basis == "direction" or strata == 1:
+            self.seen, self._found = _seen_and_passed(DirectSolver(replace(problem, basis="direction")), ids)
+        else:
+            self._found = passed_light(DirectSolver(problem, strata, next(self._seeds)), ids)
+        self._rays = len(ids) * problem.emission.size * (strata**2 if self.seen is None else 1)
         self._rows, self._texels = _with_neighbours(self._found, problem)
 
     def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
@@ -374,11 +385,35 @@ def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
 
     All of it, and nothing, is told by bits; here is what lies between, side by side by depth (``SpecularLight``).
     """
-    size, depths = direct.lighting.size, max(direct.problem.depths_apart, 1)
-    blocks = [scipy.sparse.csr_array((0, size * depths), dtype=np.float32)]
+    size = direct.lighting.size
+    blocks = []
     for a in range(0, len(ids), max(1, LANES // size)):
         some = np.asarray(ids[a : a + max(1, LANES // size)])
         place = np.repeat(some, size), np.tile(np.arange(size), len(some))
-        passed, rows = direct.partly_passed(*place), np.repeat(np.arange(len(some)), size)
-        blocks.append(_side_by_side(passed, rows, place[1], (len(some), size * depths)))
-    return scipy.sparse.vstack(blocks, format="csr")
+        blocks.append(_rows_of(direct.partly_passed(*place), len(some), direct))
+    return _stacked(blocks, direct)
+
+
+def _seen_and_passed(direct: DirectSolver, ids: Ids) -> tuple[Bits, Sparse]:
+    """``passed_light`` in the direction basis, and which points see the centres of texels."""
+    seen, blocks, size = [direct.row_storage(0)], [], direct.block_size
+    for a in range(0, len(ids), size):
+        some = np.asarray(ids[a : a + size])
+        bits, passed = direct.rows_and_passed(some)
+        seen.append(bits)
+        blocks.append(_rows_of(passed, len(some), direct))
+    return np.concatenate(seen).astype(np.uint32, copy=False), _stacked(blocks, direct)
+
+
+def _rows_of(passed: PassedLight, n: int, direct: DirectSolver) -> Sparse:
+    """Light of elements that are numbered row by row, of n rows."""
+    size = direct.lighting.size
+    rows, texels = np.divmod(passed.elements, size)
+    every = PassedLight(np.arange(len(rows)), passed.values)
+    return _side_by_side(every, rows, texels, (n, size * passed.values.shape[1]))
+
+
+def _stacked(blocks: list[Sparse], direct: DirectSolver) -> Sparse:
+    """Of no block, too."""
+    none = (0, direct.lighting.size * max(direct.problem.depths_apart, 1))
+    return scipy.sparse.vstack([scipy.sparse.csr_array(none, dtype=np.float32), *blocks], format="csr")
