@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.cache import cached_precompute
-from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
@@ -183,11 +183,9 @@ def _read(scene: mi.Scene, edge_length: float | None, shaded: bool) -> Scene:
     diffuse, if ``shaded``: what is left as diffuse is said later.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "shape '.*' is an area emitter", PrtWarning)
+        warnings.simplefilter("ignore", LampWarning)
         if shaded:
-            warnings.filterwarnings(
-                "ignore", "shape '.*': BSDF .* treats its vertices as diffuse", PrtWarning
-            )
+            warnings.simplefilter("ignore", NotDiffuseWarning)
         return Scene.from_mitsuba(scene, edge_length)
 
 

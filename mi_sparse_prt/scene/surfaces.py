@@ -28,14 +28,24 @@ from mi_sparse_prt.scene.mesh_cleaning import (
     stabilise_normals,
 )
 from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
+from mi_sparse_prt.scene.notes import Fact, Notes
 from mi_sparse_prt.scene.parametric_shapes import parametric_mesh
 from mi_sparse_prt.scene.subdivision import subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
+_INWARDS = (
+    ": faces point inwards: from outside {} vertices will be black "
+    "(set flip_normals, or use a twosided BSDF, if that is not meant)"
+)
+_FACES_INWARDS = Fact(_INWARDS.format("its"), _INWARDS.format("their"))
+_NO_AREA = Fact(": {} triangles without area are left out")
+_NO_TRIANGLE = Fact(": {} vertices that no triangle uses are left out")
+_NO_NORMAL = Fact(": {} vertices have a normal of length zero; it is computed from their faces")
+
 
 def read_surfaces(
     scene: mi.Scene, edge_length: float | None
-) -> tuple[list[tuple[TriangleMesh, Material]], list[str]]:
+) -> tuple[list[tuple[TriangleMesh, Material]], Notes]:
     """Clean triangle meshes of a Mitsuba scene, in world space, and what was handled on the user's behalf.
 
     Parameters
@@ -48,7 +58,7 @@ def read_surfaces(
     -------
     surfaces : list of (TriangleMesh, Material)
         One for each shape, and for each BSDF of the groups that have instances; a mesh may have no triangles left.
-    notes : list of str
+    notes : Notes
 
     Raises
     ------
@@ -63,7 +73,7 @@ def read_surfaces(
     placed = placed_shapes(scene)
     if not placed:
         raise PrtError("the scene has no mesh: add at least one shape")
-    notes: list[str] = []
+    notes = Notes()
     materials = [Material(where.shape, where.name, notes) for where in placed]
     clean, limit = [], most_vertices
     for where in placed:
@@ -89,15 +99,12 @@ def read_surfaces(
     return merge_groups(placed, surfaces), notes
 
 
-def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: list[str]) -> None:
+def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: Notes) -> None:
     """Note a closed shape that is black from outside."""
     if material.two_sided or material.passes_light or not len(mesh.triangles):
         return
     if faces_inwards(mesh):
-        notes.append(
-            f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
-            "(set flip_normals, or use a twosided BSDF, if that is not meant)"
-        )
+        notes.add(mesh.name, _FACES_INWARDS)
 
 
 def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> float:
@@ -140,7 +147,7 @@ def _tessellate(where: PlacedShape, material: Material, edge_length: float, limi
     )
 
 
-def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
+def _clean_mesh(shape: mi.Mesh, name: str, notes: Notes) -> TriangleMesh:
     """A Mitsuba mesh as clean triangles in world space, with the normals that Mitsuba shades with."""
     mesh = read_mesh(shape, name)
     check_geometry(mesh)
@@ -148,17 +155,15 @@ def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
         mesh = stabilise_normals(mesh, _recomputed_normals(mesh))
     mesh, dropped = drop_degenerate(mesh)
     if dropped:
-        notes.append(f"shape '{name}': {dropped} triangles without area are left out")
+        notes.add(name, _NO_AREA, dropped)
     mesh, dropped = drop_unreferenced(mesh)
     if dropped:
-        notes.append(f"shape '{name}': {dropped} vertices that no triangle uses are left out")
+        notes.add(name, _NO_TRIANGLE, dropped)
     if mesh.normals is None:  # Mitsuba shades such meshes flat
         mesh = split_by_face(mesh)
     mesh, zero = make_unit_normals(mesh)
     if zero:
-        notes.append(
-            f"shape '{name}': {zero} vertices have a normal of length zero; it is computed from their faces"
-        )
+        notes.add(name, _NO_NORMAL, zero)
     return flip_sides(mesh) if shape.has_flipped_normals() else mesh
 
 

@@ -579,6 +579,41 @@ def test_bare_mesh_gets_normals_and_loses_what_is_useless(tmp_path: Path) -> Non
     np.testing.assert_array_equal(scene.normals, np.tile([0, 0, 1], (4, 1)))
 
 
+def test_what_many_shapes_have_in_common_is_said_once() -> None:
+    plastic, gold = {"type": "roughplastic"}, {"type": "roughconductor", "material": "Au"}
+    medium = {"type": "homogeneous", "albedo": 0.5}
+    inside_out = {"type": "sphere", "flip_normals": True, "bsdf": gold}
+    shapes: dict = {f"p{k}": {"type": "rectangle", "bsdf": plastic} for k in range(5)}
+    shapes |= {f"g{k}": inside_out for k in range(2)}
+    shapes |= {f"l{k}": {"type": "disk", "emitter": {"type": "area"}} for k in range(4)}
+    shapes |= {f"m{k}": {"type": "cube", "interior": medium} for k in range(2)}
+    original = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    with pytest.warns(PrtWarning) as caught:
+        scene = Scene.from_mitsuba(original, INF)
+    assert [str(w.message) for w in caught] == scene.warnings
+    begins = [
+        "shapes 'p0', 'p1', 'p2' and 2 more: BSDF RoughPlastic is not diffuse; a matrix treats their vertices",
+        "shapes 'g0', 'g1': BSDF RoughConductor is not diffuse; a matrix treats their vertices as diffuse",
+        "shapes 'l0', 'l1', 'l2' and 1 more are area emitters: matrices of lamps (SceneEmitters) have their",
+        "shapes 'm0', 'm1' bound media: these are left out",
+        "shapes 'g0', 'g1': faces point inwards: from outside their vertices will be black",
+    ]
+    assert len(scene.warnings) == len(begins)
+    assert all(said.startswith(begin) for said, begin in zip(scene.warnings, begins, strict=True))
+
+
+def test_what_is_left_out_of_many_shapes_is_added_up(tmp_path: Path) -> None:
+    write_ply(tmp_path / "part.ply", [*SQUARE, [5, 5, 5]], [[0, 1, 2], [0, 2, 3], [1, 1, 2]])
+    shape = '<shape type="ply" id="{}"><string name="filename" value="part.ply"/></shape>'
+    content = shape.format("a") + shape.format("b")
+    with pytest.warns(PrtWarning):
+        scene = load_scene(write_xml(tmp_path / "x.xml", content), INF)
+    assert scene.warnings == [
+        "shapes 'a', 'b': 2 triangles without area are left out",
+        "shapes 'a', 'b': 2 vertices that no triangle uses are left out",
+    ]
+
+
 def test_duplicate_vertices_are_kept(tmp_path: Path) -> None:
     scene = ply_scene(tmp_path, [*SQUARE, SQUARE[0], SQUARE[2]], [[0, 1, 2], [4, 5, 3]])
     assert scene.n_vertices == 6

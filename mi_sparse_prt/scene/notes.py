@@ -1,0 +1,54 @@
+"""What is handled on the user's behalf while a scene is read: each fact is said once, of however many shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from mi_sparse_prt.core.errors import PrtWarning
+
+
+class Fact(NamedTuple):
+    """What there is to say of a shape, after its name.
+
+    Attributes
+    ----------
+    one : str
+        A ``{}`` in it is a number.
+    many : str
+        The same of several shapes, whose numbers are added up; empty if it reads alike.
+    category : type of PrtWarning
+    """
+
+    one: str
+    many: str = ""
+    category: type[PrtWarning] = PrtWarning
+
+
+class Notes:
+    """Facts, and the shapes that each of them is about."""
+
+    def __init__(self) -> None:
+        self._about: dict[Fact, tuple[list[str], list[int]]] = {}
+
+    def add(self, shape: str, fact: Fact, number: int = 0) -> None:
+        """Note a fact about a shape."""
+        names, numbers = self._about.setdefault(fact, ([], []))
+        names.append(shape)
+        numbers.append(number)
+
+    def warnings(self) -> list[PrtWarning]:
+        """One for each fact, in the order in which they came up."""
+        found = []
+        for fact, (names, numbers) in self._about.items():
+            several = len(names) > 1
+            said = ((several and fact.many) or fact.one).format(sum(numbers))
+            found.append(fact.category(f"shape{'s' if several else ''} {listed(names)}{said}"))
+        return found
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names of shapes, and how many there are more."""
+    most = 3
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(f"'{name}'" for name in names[:most]) + more
