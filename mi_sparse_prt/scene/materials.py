@@ -35,8 +35,8 @@ _LAMP = Fact(
     LampWarning,
 )
 _MEDIUM = Fact(
-    " bounds a medium: media are left out, light passes as through a vacuum",
-    " bound media: these are left out, light passes as through a vacuum",
+    " bounds a medium: media are left out, light passes as through a vacuum (volpath renders them)",
+    " bound media: these are left out, light passes as through a vacuum (volpath renders them)",
 )
 
 #: Filters and wrap modes of bitmaps; what Mitsuba takes unless told otherwise comes first.

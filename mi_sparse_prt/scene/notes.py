@@ -9,7 +9,7 @@ from mi_sparse_prt.core.errors import PrtWarning
 
 
 class Fact(NamedTuple):
-    """What there is to say of a shape, after its name.
+    """What there is to say of a shape, or of another thing, after its name.
 
     Attributes
     ----------
@@ -18,11 +18,13 @@ class Fact(NamedTuple):
     many : str
         The same of several shapes, whose numbers are added up; empty if it reads alike.
     category : type of PrtWarning
+    thing : str
     """
 
     one: str
     many: str = ""
     category: type[PrtWarning] = PrtWarning
+    thing: str = "shape"
 
 
 class Notes:
@@ -32,7 +34,7 @@ class Notes:
         self._about: dict[Fact, tuple[list[str], list[int]]] = {}
 
     def add(self, shape: str, fact: Fact, number: int = 0) -> None:
-        """Note a fact about a shape."""
+        """Note a fact about a shape, or another thing."""
         names, numbers = self._about.setdefault(fact, ([], []))
         names.append(shape)
         numbers.append(number)
@@ -41,10 +43,14 @@ class Notes:
         """One for each fact, in the order in which they came up."""
         found = []
         for fact, (names, numbers) in self._about.items():
-            several = len(names) > 1
-            said = ((several and fact.many) or fact.one).format(sum(numbers))
-            found.append(fact.category(f"shape{'s' if several else ''} {listed(names)}{said}"))
+            said = ((len(names) > 1 and fact.many) or fact.one).format(sum(numbers))
+            found.append(fact.category(about(fact.thing, names) + said))
         return found
+
+
+def about(thing: str, names: Sequence[str]) -> str:
+    """What a sentence is about: one thing or several, by name."""
+    return f"{thing}{'s' if len(names) > 1 else ''} {listed(names)}"
 
 
 def listed(names: Sequence[str]) -> str:

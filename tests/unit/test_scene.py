@@ -1,6 +1,7 @@
 """Loading: vertices, normals, albedo, the unit-box copy, hashes, and what is refused."""
 
 import itertools
+import re
 import runpy
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import mi_sparse_prt  # noqa: F401  chooses the variant
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.measurement.measurement import mesh_vertices
+from mi_sparse_prt.scene import surfaces
 from mi_sparse_prt.scene.loading import load_scene
 from mi_sparse_prt.scene.mesh_cleaning import check_geometry
 from mi_sparse_prt.scene.scene import Scene
@@ -600,6 +602,26 @@ def test_what_many_shapes_have_in_common_is_said_once() -> None:
     ]
     assert len(scene.warnings) == len(begins)
     assert all(said.startswith(begin) for said, begin in zip(scene.warnings, begins, strict=True))
+
+
+def test_cameras_and_lamps_in_media_are_named() -> None:
+    fog = {"type": "homogeneous"}
+    lamps = {f"lamp{k}": {"type": "point", "medium": fog} for k in range(2)}
+    camera = {"type": "perspective", "medium": fog}
+    original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "eye": camera, **lamps})
+    with pytest.warns(PrtWarning) as caught:
+        Scene.from_mitsuba(original, INF)
+    eye, both = sorted((str(w.message) for w in caught), reverse=True)
+    assert eye.startswith("sensor 'eye' is inside a medium: media are left out")
+    assert re.match("emitters 'lamp.', 'lamp.' are inside media: media are left out", both)
+
+
+def test_what_cannot_be_used_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surfaces, "_clean_mesh", lambda *_: pytest.fail("a mesh was read"))
+    blob = {"type": "sdfgrid", "filename": str(SCENES / "zoo/blob.vol")}
+    original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "a": blob, "b": blob})
+    with pytest.raises(PrtError, match=r"^shapes '.', '.' are of type SDFGrid.*replace them by a mesh"):
+        Scene.from_mitsuba(original, INF)
 
 
 def test_what_is_left_out_of_many_shapes_is_added_up(tmp_path: Path) -> None:
