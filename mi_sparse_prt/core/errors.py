@@ -7,3 +7,11 @@ class PrtError(ValueError):
 
 class PrtWarning(UserWarning):
     """Something was handled on the user's behalf (negative pixels clamped, a mesh facing inwards)."""
+
+
+class NotDiffuseWarning(PrtWarning):
+    """A surface is not diffuse, and a matrix without terms takes it for diffuse."""
+
+
+class LampWarning(PrtWarning):
+    """A shape shines, and a matrix of distant light has none of it."""

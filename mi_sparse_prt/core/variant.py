@@ -31,6 +31,13 @@ def variant() -> str | None:
     return mi.variant()
 
 
+def check_variant() -> None:
+    """Refuse to go on in a variant that was set later and is not supported (PrtError)."""
+    name = variant()
+    if name not in VARIANTS:
+        raise PrtError(f"variant {name} is not supported: use llvm_ad_rgb or cuda_ad_rgb")
+
+
 def choose_variant(name: str | None = None) -> str:
     """Make sure that Mitsuba runs in a variant which the package supports.
 

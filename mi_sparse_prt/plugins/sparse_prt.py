@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.cache import cached_precompute
-from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
@@ -44,6 +44,9 @@ class SparsePRT(mi.SamplingIntegrator):
     ``mi.traverse`` and ``update`` on the environment, or on how bright a lamp is (``radiance.value``,
     ``intensity.value``, ``irradiance.value``, ``scale``), relight; no matrix is computed again. A lamp that moved,
     turned or has another texture needs the matrix of lamps again; other geometry or materials need both.
+
+    Films, crop windows, samplers, the alpha channel and ``hide_emitters`` are those of ``path``. An ``aov`` integrator
+    may be put around this one; it then relights twice.
 
     .. tabs::
         .. code-tab:: xml
@@ -84,9 +87,10 @@ class SparsePRT(mi.SamplingIntegrator):
     edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
+    hide_emitters       boolean    As for ``path``: cameras see through area lamps, and no environment. (false)
     progress            boolean    Show a forecast and progress bars while precomputing. (true)
     reference           boolean    Render with the nested integrator instead. (false)
-    (nested)            integrator The reference. (``path`` of the same ``max_depth``)
+    (nested)            integrator The reference. (``path`` of the same ``max_depth`` and ``hide_emitters``)
     =================== ========== =============================================================================
     """
 
@@ -113,10 +117,10 @@ class SparsePRT(mi.SamplingIntegrator):
         self._cache = Path(cache) if cache else None
         self._progress = props.get("progress", True)
         self._use_reference = props.get("reference", False)
+        self._hide_emitters = props.get("hide_emitters", False)
         nested = [value for _, value in props.objects() if isinstance(value, mi.Integrator)]
-        self._reference = (
-            nested[0] if nested else mi.load_dict({"type": "path", "max_depth": self._settings["max_depth"]})
-        )
+        usual = {"max_depth": self._settings["max_depth"], "hide_emitters": self._hide_emitters}
+        self._reference = nested[0] if nested else mi.load_dict({"type": "path", **usual})
 
     def render(
         self,
@@ -134,8 +138,23 @@ class SparsePRT(mi.SamplingIntegrator):
         PrtError
             If the scene has no light, or cannot be used (see ``prt.load_scene``, ``prt.precompute``).
         """
+        return self._looking_at(scene).render(scene, sensor, seed, spp, develop, evaluate)
+
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Mask = True,
+    ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
+        """What integrators around this one ask for, ``aov`` and ``moment``; see ``render``."""
+        return self._looking_at(scene).sample(scene, sampler, ray, medium, active)
+
+    def _looking_at(self, scene: mi.Scene) -> mi.SamplingIntegrator:
+        """The integrator that looks at the relit surfaces of a scene, or the reference."""
         if self._use_reference:
-            return self._reference.render(scene, sensor, seed, spp, develop, evaluate)
+            return self._reference
         lamps = _has_lamps(scene)
         if scene.environment() is None and not lamps:
             raise PrtError(
@@ -144,8 +163,9 @@ class SparsePRT(mi.SamplingIntegrator):
         surfaces = _read(scene, self._edge_length, self._settings["terms"] == AUTO_TERMS)
         relit = self._relit(surfaces, scene.environment(), lamps)
         depth = self._settings["max_depth"]
-        integrator = LampLitIntegrator(relit, scene, depth) if lamps else RelitIntegrator(relit[0])
-        return integrator.render(scene, sensor, seed, spp, develop, evaluate)
+        if lamps:
+            return LampLitIntegrator(relit, scene, depth, self._hide_emitters)
+        return RelitIntegrator(relit[0], self._hide_emitters)
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:
         """All light but that which lamps send to the camera directly or after one reflection."""
@@ -183,11 +203,9 @@ def _read(scene: mi.Scene, edge_length: float | None, shaded: bool) -> Scene:
     diffuse, if ``shaded``: what is left as diffuse is said later.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "shape '.*' is an area emitter", PrtWarning)
+        warnings.simplefilter("ignore", LampWarning)
         if shaded:
-            warnings.filterwarnings(
-                "ignore", "shape '.*': BSDF .* treats its vertices as diffuse", PrtWarning
-            )
+            warnings.simplefilter("ignore", NotDiffuseWarning)
         return Scene.from_mitsuba(scene, edge_length)
 
 

@@ -26,16 +26,18 @@ from mi_sparse_prt.reflection.frames import beside_vertices, vertex_tangents
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
 from mi_sparse_prt.scene.materials import Material, bsdf_class
+from mi_sparse_prt.scene.notes import Fact, Notes, listed
 from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = (
     0.1  # error of images from which factors are left out, and cameras follow rays: a diffuse surface has 1
 )
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
-NO_TANGENTS = (
-    "shape '{}': its BSDF is anisotropic and it has no texture coordinates: Mitsuba then takes the first edge of each "
-    "triangle for its tangent, which vertices cannot follow; give it texture coordinates"
+_TANGENTS = (
+    ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
+    "its tangent, which vertices cannot follow; give {2} texture coordinates"
 )
+_NO_TANGENTS = Fact(_TANGENTS.format("its", "it has", "it"), _TANGENTS.format("their", "they have", "them"))
 
 # factors of a BSDF, and the names of its shapes; None if it counts as diffuse
 Find = Callable[[Material, list[str]], BrdfFactors | None]
@@ -109,27 +111,27 @@ class _Choice:
 
     def __init__(self, bound: float) -> None:
         self._bound = bound
-        self._left: list[str] = []
-        self._off: list[str] = []
+        self._left: dict[str, list[str]] = {}  # names of surfaces, by why no factors stand for them
+        self._off: dict[str, list[str]] = {}  # by kind of BSDF and error
 
     def factors(self, material: Material, names: list[str]) -> BrdfFactors | None:
         """Of a surface that is glossy and can be factored."""
-        shapes, kind = _listed(names), bsdf_class(material.bsdf)
+        kind = bsdf_class(material.bsdf)
         if material.rough_glass or not material.glossy and not material.bends_normals:
             return None  # rays go on there
         if material.bends_normals:
-            self._left.append(f"{shapes} ({kind} bends the shading normals)")
+            self._left.setdefault(f"{kind} bends the shading normals", []).extend(names)
             return None
         try:
             found, error = factors_for_images(material.bsdf, names[0], self._bound)
         except UnfactorableError as problem:
-            self._left.append(f"{shapes} ({problem.reason.removeprefix('BSDF ')})")
+            self._left.setdefault(problem.reason.removeprefix("BSDF "), []).extend(names)
             return None
         if error > TOO_NARROW:
-            self._left.append(f"{shapes} (the lobe of {kind} is too narrow)")
+            self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > self._bound:
-            self._off.append(f"{shapes} ({kind}, {error:.1%})")
+            self._off.setdefault(f"{kind}, {error:.1%}", []).extend(names)
         if error > FOLLOWED * self._bound:
             few, _ = factors_for_images(material.bsdf, names[0], TOO_NARROW)
             return replace(few, followed=True)
@@ -141,22 +143,19 @@ class _Choice:
         if self._left:
             said.append(
                 f"no factors stand for some glossy surfaces: cameras' rays go on there, to others they are as diffuse, "
-                f"which the estimated error does not know: {', '.join(self._left)}"
+                f"which the estimated error does not know: {_by_reason(self._left)}"
             )
         if self._off:
             said.append(
                 f"16 factors leave more than {self._bound:.1%} of the light that surfaces reflect, which the estimated "
-                f"error does not know; where it is twice as much, cameras' rays go on: {', '.join(self._off)}"
+                f"error does not know; where it is twice as much, cameras' rays go on: {_by_reason(self._off)}"
             )
         if said:
             warnings.warn("; ".join(said), PrtWarning, stacklevel=4)
 
 
-def _listed(names: list[str]) -> str:
-    """The first names of shapes, and how many there are more."""
-    most = 3
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(f"'{name}'" for name in names[:most]) + more
+def _by_reason(surfaces: dict[str, list[str]]) -> str:
+    return ", ".join(f"{listed(names)} ({reason})" for reason, names in surfaces.items())
 
 
 def _with_factors(scene: Scene, find: Find, harmonics: int | None = None) -> InOutFactors | None:
@@ -167,27 +166,34 @@ def _with_factors(scene: Scene, find: Find, harmonics: int | None = None) -> InO
             alike.setdefault(own.digest(), []).append(k)
     material, albedo, factors = np.full(scene.n_vertices, -1), scene.albedo.copy(), list[BrdfFactors]()
     beside = cache(lambda: beside_vertices(scene))  # of few scenes, but of all meshes there
+    notes = Notes()
     for some in alike.values():
         found = find(scene.materials[some[0]], [scene.meshes[k].name for k in some])
         if found is None:
             continue
         for k in some:
             material[scene.meshes[k].vertices] = len(factors)
-            albedo[scene.meshes[k].vertices] = _diffuse_part(scene, k, found, beside)
+            albedo[scene.meshes[k].vertices] = _diffuse_part(scene, k, found, beside, notes)
         factors.append(found)
+    for note in notes.warnings():
+        warnings.warn(note, stacklevel=5)
     if not factors:
         return None
     return InOutFactors(albedo, vertex_tangents(scene), scene.normals, material, tuple(factors), harmonics)
 
 
 def _diffuse_part(
-    scene: Scene, number: int, factors: BrdfFactors, beside: Callable[[], mi.SurfaceInteraction3f]
+    scene: Scene,
+    number: int,
+    factors: BrdfFactors,
+    beside: Callable[[], mi.SurfaceInteraction3f],
+    notes: Notes,
 ) -> NDArray[np.floating]:
     """Its reflectance, (channels,) or (vertices, 3), on one of a scene's meshes."""
     mesh, own = scene.meshes[number], scene.materials[number]
     textured = scene.mitsuba.shapes()[mesh.shape].has_vertex_texcoords()
     if not textured and is_anisotropic(own.bsdf, mesh.name):
-        warnings.warn(NO_TANGENTS.format(mesh.name), PrtWarning, stacklevel=6)
+        notes.add(mesh.name, _NO_TANGENTS)
     if not factors.varying_diffuse:
         return factors.diffuse
     here = dr.arange(mi.UInt32, mesh.vertices.start, mesh.vertices.stop)

@@ -31,11 +31,14 @@ class Way(NamedTuple):
         None may reflect after these.
     density : Float
         With which its direction was chosen, per solid angle; 0 if it could be no other.
+    met : Mask
+        It met more than surfaces that it passed straight on.
     """
 
     depth: Any
     last: Any
     density: Any
+    met: Any
 
 
 class Seen(NamedTuple):
@@ -76,7 +79,7 @@ def follow(
     active: mi.Mask,
     max_depth: int,
 ) -> tuple[mi.Color3f, mi.Mask]:
-    """The radiance of what rays see that go on from surfaces, and whether they meet any.
+    """The radiance of what rays see that go on from surfaces, and whether they meet more than they pass straight on.
 
     Parameters
     ----------
@@ -93,17 +96,28 @@ def follow(
     limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
     active &= depth < limit
     while active:
-        radiance, si, whole = seen(ray, Way(depth, depth + 1 >= limit, density), sampler, active)
+        radiance, si, whole = seen(ray, Way(depth, depth + 1 >= limit, density, valid), sampler, active)
         total += dr.select(active, throughput * radiance, 0)
         active &= si.is_valid()
-        valid |= active
         sample, weight = _scattered(si, whole, sampler, active)
+        valid |= active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         density = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, sample.pdf)
         throughput *= weight
         ray = si.spawn_ray(si.to_world(sample.wo))
         depth += 1
         active &= (depth < limit) & (dr.max(throughput) > 0)
     return total, valid
+
+
+@dr.syntax
+def past_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Mask) -> mi.Ray3f:
+    """Rays that begin behind all area lamps which they would meet first."""
+    ray, on_lamp = mi.Ray3f(ray), mi.Mask(active)
+    while on_lamp:
+        si = scene.ray_intersect(ray, on_lamp)
+        on_lamp &= si.is_valid() & (si.shape.emitter() != None)  # noqa: E711  Dr.Jit compares each
+        ray = dr.select(on_lamp, si.spawn_ray(ray.d), ray)
+    return ray
 
 
 def _scattered(

@@ -7,7 +7,9 @@ that these scatter (``relighting.followed_rays``).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -28,6 +30,7 @@ from mi_sparse_prt.relighting.followed_rays import (
     Way,
     background_light,
     follow,
+    past_lamps,
     reflected_background,
     surfaces_to_follow,
 )
@@ -83,22 +86,33 @@ class RelitScene:
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
 
-    def radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
-        """Radiance towards the origins of rays (world), and which rays meet a surface."""
-        if self._goes_on:
-            return follow(self._seen, ray, sampler, active, self.max_depth)
-        found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), active, active)
-        value = found.radiance
-        if self._background is not None:
-            value = dr.select(active & ~found.si.is_valid(), self._background.eval(found.si, active), value)
-        return value, active & found.si.is_valid()
+    def radiance(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask, hide_background: bool = False
+    ) -> tuple[mi.Color3f, mi.Mask]:
+        """Radiance towards the origins of rays (world), and which rays meet what is opaque, as for ``path``.
 
-    def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
-        """See ``follow``."""
+        A background that is seen is opaque. If it is hidden, it is so for rays that came straight from their origins.
+        """
+        shown = None if hide_background else self._background
+        if self._goes_on:
+            value, valid = follow(partial(self._seen, shown), ray, sampler, active, self.max_depth)
+        else:
+            found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), active, active)
+            value, valid = found.radiance, active & found.si.is_valid()
+            if shown is not None:
+                value = dr.select(active & ~valid, shown.eval(found.si, active), value)
+        return value, valid if shown is None else active
+
+    def _seen(
+        self, shown: mi.Emitter | None, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask
+    ) -> Seen:
+        """See ``follow``; what is ``shown`` is the background of rays that come straight from a camera."""
         u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
         value, si, whole = self._met(ray, u, way.depth, active, active & ~way.last)
         if self._background is not None:
-            value += background_light(self._background, ray, way, active & ~si.is_valid())
+            leaves = active & ~si.is_valid()
+            leaves &= way.met if shown is None else True
+            value += background_light(self._background, ray, way, leaves)
             if self.followed:
                 reflects = active & ~way.last & whole
                 value += reflected_background(self._background, self._scene, si, sampler, reflects)
@@ -262,11 +276,18 @@ def _numbers(scene: Scene, surfaces: InOutFactors) -> list[int]:
 
 
 class RelitIntegrator(mi.SamplingIntegrator):
-    """A Mitsuba integrator that looks at a ``RelitScene``; sampling, filtering and films are Mitsuba's own."""
+    """A Mitsuba integrator that looks at a ``RelitScene``; sampling, filtering and films are Mitsuba's own.
 
-    def __init__(self, relit: RelitScene) -> None:
+    Parameters
+    ----------
+    relit : RelitScene
+    hide_emitters : bool
+        As for ``path``: a camera sees through area lamps, and no background.
+    """
+
+    def __init__(self, relit: RelitScene, hide_emitters: bool = False) -> None:
         super().__init__(mi.Properties())
-        self._relit = relit
+        self._relit, self._hide_emitters = relit, hide_emitters
 
     def sample(
         self,
@@ -276,8 +297,15 @@ class RelitIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Mask = True,
     ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
-        value, valid = self._relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))
+        ray, active = mi.Ray3f(ray), mi.Mask(active)
+        if self._hide_emitters:
+            ray = past_lamps(scene, ray, active)
+        value, valid = self._radiance(ray, sampler, active)
         return value, valid, []
+
+    def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+        """What rays see that begin behind all that is hidden, see ``RelitScene.radiance``."""
+        return self._relit.radiance(ray, sampler, active, self._hide_emitters)
 
 
 def render(
@@ -309,6 +337,7 @@ def render(
     Returns
     -------
     (height, width, 3) float32, linear RGB
+        Of the film's crop window, whatever its pixel format.
 
     Raises
     ------
@@ -362,9 +391,20 @@ def _rendered(
             rendered = mi.render(
                 scene.mitsuba, sensor=sensor, integrator=integrator, spp=samples, seed=seed + _SEEDS * first
             )
-            passes.append(np.array(rendered)[..., :3] * np.float32(samples / spp))
+            passes.append(_linear_rgb(np.array(rendered), sensor.film()) * np.float32(samples / spp))
             bar.update(samples)
     return np.sum(passes, axis=0, dtype=np.float32)
+
+
+def _linear_rgb(image: NDArray[np.float32], film: mi.Film) -> NDArray[np.float32]:
+    """What a film has developed (h, w, channels), in three channels."""
+    kind = re.search(r"pixel_format = (y|xyz)a?,", str(film))
+    if kind is None:
+        return image[..., :3]
+    kept = mi.Bitmap(
+        np.ascontiguousarray(image[..., : len(kind[1])]), getattr(mi.Bitmap.PixelFormat, kind[1].upper())
+    )
+    return np.array(kept.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
 
 
 def background_emitter(

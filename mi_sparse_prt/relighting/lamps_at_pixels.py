@@ -29,32 +29,29 @@ class LampLitIntegrator(RelitIntegrator):
         The shapes and the lamps, and maybe an environment, which is left out.
     max_depth : int
         As for ``path``, at least 2 or -1.
+    hide_emitters : bool
+        See ``RelitIntegrator``.
     """
 
-    def __init__(self, relit: Sequence[RelitScene], scene: mi.Scene, max_depth: int) -> None:
-        super().__init__(relit[0])
+    def __init__(
+        self, relit: Sequence[RelitScene], scene: mi.Scene, max_depth: int, hide_emitters: bool = False
+    ) -> None:
+        super().__init__(relit[0], hide_emitters)
         self._more = relit[1:]
         self._scene = scene if scene.environment() is None else without_environment(scene)
         self._direct = mi.load_dict({"type": "path", "max_depth": 2})
         self._followed, self._max_depth = relit[-1].followed, max_depth
         self._goes_on = has_mirrors(scene) or bool(self._followed)
 
-    def sample(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.RayDifferential3f,
-        medium: mi.Medium | None = None,
-        active: mi.Mask = True,
-    ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
-        value, valid, others = super().sample(scene, sampler, ray, medium, active)
+    def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
+        value, valid = super()._radiance(ray, sampler, active)
         for relit in self._more:
-            value += relit.radiance(mi.Ray3f(ray), sampler, mi.Mask(active))[0]
+            value += relit.radiance(ray, sampler, active)[0]
         if self._goes_on:
-            direct, _ = follow(self._seen, mi.Ray3f(ray), sampler, mi.Mask(active), self._max_depth)
+            direct, _ = follow(self._seen, ray, sampler, active, self._max_depth)
         else:
-            direct, _, _ = self._direct.sample(self._scene, sampler, ray, medium, active)
-        return value + direct, valid, others
+            direct, _, _ = self._direct.sample(self._scene, sampler, mi.RayDifferential3f(ray), None, active)
+        return value + direct, valid
 
     def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
         """See ``follow``; a lamp seen in a mirror is among the mirror's direct light."""

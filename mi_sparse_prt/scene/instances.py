@@ -145,16 +145,24 @@ def _channels(mesh: TriangleMesh) -> tuple[Hashable, ...]:
 
 def _instances(scene: mi.Scene) -> list[tuple[mi.Shape, NDArray[np.float64]]]:
     """The groups of a scene that have instances, and where these stand: (k, 4, 4), world from group."""
-    to_world: dict[str, list[NDArray[np.float64]]] = {}
-    for shape in scene.shapes():
-        # Mitsuba shows an instance's transform as a parameter, and its group only where it prints it
-        if shape.class_name() == "Instance" and (group := re.search(r'name = "([^"]*)"', str(shape))):
+    instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
+    groups = [thing for _, thing in children(scene) if isinstance(thing, mi.Shape)] if instances else []
+    ids = [group.id() for group in groups]
+    to_world: dict[int, list[NDArray[np.float64]]] = {}
+    try:
+        # Mitsuba shows an instance's transform as a parameter, and of its group nothing but the id, where it prints it:
+        # several may have the same
+        for k, group in enumerate(groups):
+            group.set_id(str(k))
+        for shape in instances:
+            found = re.search(r'name = "(\d+)"', str(shape))
+            assert found is not None
             matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
-            to_world.setdefault(group.group(1), []).append(matrix)
-    if not to_world:
-        return []
-    groups = {thing.id(): thing for _, thing in children(scene) if isinstance(thing, mi.Shape)}
-    return [(groups[name], np.stack(matrices)) for name, matrices in to_world.items()]
+            to_world.setdefault(int(found[1]), []).append(matrix)
+    finally:
+        for group, name in zip(groups, ids, strict=True):
+            group.set_id(name)
+    return [(groups[k], np.stack(matrices)) for k, matrices in to_world.items()]
 
 
 def _name(shape: mi.Shape, k: int) -> str:

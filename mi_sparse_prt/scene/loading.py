@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.variant import check_variant
 from mi_sparse_prt.scene.scene import Scene
 
 
@@ -27,8 +28,9 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
     Raises
     ------
     PrtError
-        Missing file, XML or plugin error, and everything that `Scene.from_mitsuba` refuses.
+        Another variant than rgb, missing file, XML or plugin error, and everything that `Scene.from_mitsuba` refuses.
     """
+    check_variant()
     path = Path(path)
     if not path.is_file():
         raise PrtError(f"scene file {path} does not exist: check the path")

@@ -13,7 +13,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
+from mi_sparse_prt.scene.notes import Fact, Notes
 from mi_sparse_prt.scene.traversal import children
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
@@ -27,6 +28,16 @@ SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 
 #: BSDFs that bend the shading normal of the one that they wrap.
 BUMPED = {"NormalMap", "BumpMap"}
+
+_LAMP = Fact(
+    " is an area emitter: matrices of lamps (SceneEmitters) have its light, those of a cubemap do not",
+    " are area emitters: matrices of lamps (SceneEmitters) have their light, those of a cubemap do not",
+    LampWarning,
+)
+_MEDIUM = Fact(
+    " bounds a medium: media are left out, light passes as through a vacuum (volpath renders them)",
+    " bound media: these are left out, light passes as through a vacuum (volpath renders them)",
+)
 
 #: Filters and wrap modes of bitmaps; what Mitsuba takes unless told otherwise comes first.
 _LOOKUPS = [(f, w) for f in ("Linear", "Nearest") for w in ("Repeat", "Mirror", "Clamp")]
@@ -83,26 +94,17 @@ class Material:
         It certainly does not vary over the surface nor with its rotation, and neither does the shape's own light.
     """
 
-    def __init__(self, shape: mi.Shape, name: str, notes: list[str]) -> None:
+    def __init__(self, shape: mi.Shape, name: str, notes: Notes) -> None:
         self.name = name
         self._emitter = shape.emitter() if shape.is_emitter() else None
         self._radiance = None if self._emitter is None else _radiance(self._emitter)
         self._set_bsdf(shape.bsdf(), 1)
         if not self.diffuse:
-            what = "bends the shading normals" if self._lambertian else "is not diffuse"
-            notes.append(
-                f"shape '{name}': BSDF {bsdf_class(self.bsdf)} {what}; a matrix treats its vertices as diffuse "
-                'with the same reflectance unless it is given terms="auto", indirect paths use the real BSDF'
-            )
+            notes.add(name, _not_diffuse(self.bsdf, self._lambertian))
         if self._emitter is not None:
-            notes.append(
-                f"shape '{name}' is an area emitter: matrices of lamps (SceneEmitters) have its light, "
-                "those of a cubemap do not"
-            )
+            notes.add(name, _LAMP)
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
-            notes.append(
-                f"shape '{name}' bounds a medium: media are left out, light passes as through a vacuum"
-            )
+            notes.add(name, _MEDIUM)
 
     def _set_bsdf(self, bsdf: mi.BSDF, side: int) -> None:
         """Look at a BSDF from its front (1) or its back (-1)."""
@@ -236,6 +238,16 @@ def digest(text: str, parameters: mi.SceneParameters, left_out: tuple[str, ...] 
             found = _lookup(texture, value, parameters[name.removesuffix("data") + "to_uv"])
             state.update(str(found).encode() if found != _LOOKUPS[0] else b"")
     return state.digest()
+
+
+def _not_diffuse(bsdf: mi.BSDF, lambertian: bool) -> Fact:
+    """What there is to say of shapes with a BSDF that is not diffuse, or not but for its normals."""
+    what = "bends the shading normals" if lambertian else "is not diffuse"
+    said = (
+        f": BSDF {bsdf_class(bsdf)} {what}; a matrix treats {{}} vertices as diffuse with the same reflectance "
+        'unless it is given terms="auto", indirect paths use the real BSDF'
+    )
+    return Fact(said.format("its"), said.format("their"), NotDiffuseWarning)
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Texture | None:

@@ -88,7 +88,9 @@ class Scene:
         float32 world positions still know.
     normalised_positions : (n_v, 3) float32
     warnings : list of str
-        What was handled on the user's behalf; each was also issued as a `PrtWarning`.
+        What was handled on the user's behalf, a sentence for each fact; each was also issued as a `PrtWarning`.
+    notes : list of PrtWarning
+        These themselves.
     materials : list of Material
         One for each mesh.
     path : str or None
@@ -98,7 +100,7 @@ class Scene:
     def __init__(self, mitsuba: mi.Scene, meshes: list[TriangleMesh], materials: list[Material]) -> None:
         """Use `Scene.from_mitsuba`; `meshes` are clean and in world space, `materials` one for each."""
         self.path: str | None = None
-        self.warnings: list[str] = []
+        self.notes: list[PrtWarning] = []
         fronts = np.concatenate([m.positions for m in meshes])
         low, high = (f(fronts, axis=0).astype(np.float64) for f in (np.min, np.max))
         self.centre: NDArray[np.float64] = (low + high) / 2
@@ -172,12 +174,17 @@ class Scene:
         if not used:
             raise PrtError("the scene has no triangle with an area: nothing to compute transport for")
         result = cls(scene, [mesh for mesh, _ in used], [material for _, material in used])
-        result.warnings = notes
+        result.notes = notes.warnings()
         return result
 
     def _warn(self) -> None:
-        for sentence in self.warnings:
-            warnings.warn(sentence, PrtWarning, stacklevel=3)
+        for note in self.notes:
+            warnings.warn(note, stacklevel=3)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was handled on the user's behalf."""
+        return [str(note) for note in self.notes]
 
     def unlit_shapes(self) -> list[mi.Mesh]:
         """The world-space meshes without their area emitters, for scenes with other light."""

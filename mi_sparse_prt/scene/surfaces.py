@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from itertools import product
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.variant import check_variant
 from mi_sparse_prt.scene.curves import curve_mesh
 from mi_sparse_prt.scene.ellipsoids import ellipsoids_mesh
 from mi_sparse_prt.scene.instances import PlacedShape, merge_groups, moved, placed_shapes
@@ -28,14 +28,31 @@ from mi_sparse_prt.scene.mesh_cleaning import (
     stabilise_normals,
 )
 from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
+from mi_sparse_prt.scene.notes import Fact, Notes, about
 from mi_sparse_prt.scene.parametric_shapes import parametric_mesh
 from mi_sparse_prt.scene.subdivision import subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
+_BECOME_TRIANGLES = {"Sphere", "Disk", "Cylinder", "BSplineCurve", "LinearCurve", "Ellipsoids"}
+
+_INSIDE = " {} inside {}: media are left out, light passes as through a vacuum (volpath renders them)"
+_SENSOR, _EMITTER = (
+    Fact(_INSIDE.format("is", "a medium"), _INSIDE.format("are", "media"), thing=thing)
+    for thing in ("sensor", "emitter")
+)
+_INWARDS = (
+    ": faces point inwards: from outside {} vertices will be black "
+    "(set flip_normals, or use a twosided BSDF, if that is not meant)"
+)
+_FACES_INWARDS = Fact(_INWARDS.format("its"), _INWARDS.format("their"))
+_NO_AREA = Fact(": {} triangles without area are left out")
+_NO_TRIANGLE = Fact(": {} vertices that no triangle uses are left out")
+_NO_NORMAL = Fact(": {} vertices have a normal of length zero; it is computed from their faces")
+
 
 def read_surfaces(
     scene: mi.Scene, edge_length: float | None
-) -> tuple[list[tuple[TriangleMesh, Material]], list[str]]:
+) -> tuple[list[tuple[TriangleMesh, Material]], Notes]:
     """Clean triangle meshes of a Mitsuba scene, in world space, and what was handled on the user's behalf.
 
     Parameters
@@ -48,22 +65,23 @@ def read_surfaces(
     -------
     surfaces : list of (TriangleMesh, Material)
         One for each shape, and for each BSDF of the groups that have instances; a mesh may have no triangles left.
-    notes : list of str
+    notes : Notes
 
     Raises
     ------
     PrtError
         As for `Scene.from_mitsuba`.
     """
-    if not mi.is_rgb or not dr.is_jit_v(mi.Float):
-        raise PrtError(f"variant {mi.variant()} is not supported: use llvm_ad_rgb or cuda_ad_rgb")
+    check_variant()
     if edge_length is not None and not edge_length > 0:
         raise PrtError(f"edge_length must be positive (or inf), not {edge_length}")
     most_vertices = 5_000_000  # 6144 directions would need 4 GB of visibility bits alone
     placed = placed_shapes(scene)
     if not placed:
         raise PrtError("the scene has no mesh: add at least one shape")
-    notes: list[str] = []
+    _refuse_others(placed)
+    notes = Notes()
+    _note_media(scene, notes)
     materials = [Material(where.shape, where.name, notes) for where in placed]
     clean, limit = [], most_vertices
     for where in placed:
@@ -89,15 +107,36 @@ def read_surfaces(
     return merge_groups(placed, surfaces), notes
 
 
-def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: list[str]) -> None:
+def _refuse_others(placed: list[PlacedShape]) -> None:
+    """Refuse shapes that do not become triangles, before any work is done."""
+    others: dict[str, list[str]] = {}
+    for where in placed:
+        if not where.shape.is_mesh() and where.shape.class_name() not in _BECOME_TRIANGLES:
+            others.setdefault(where.shape.class_name(), []).append(where.name)
+    for kind, names in others.items():
+        are, it = ("are", "them") if len(names) > 1 else ("is", "it")
+        raise PrtError(
+            f"{about('shape', names)} {are} of type {kind}, which is not made of triangles: "
+            f"replace {it} by a mesh (ply, obj)"
+        )
+
+
+def _note_media(scene: mi.Scene, notes: Notes) -> None:
+    """Note cameras and lamps in media; shapes that bound media are noted with their materials."""
+    for thing, fact in (
+        *((sensor, _SENSOR) for sensor in scene.sensors()),
+        *((emitter, _EMITTER) for emitter in scene.emitters()),
+    ):
+        if thing.get_medium() is not None and thing.get_shape() is None:
+            notes.add(thing.id(), fact)
+
+
+def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: Notes) -> None:
     """Note a closed shape that is black from outside."""
     if material.two_sided or material.passes_light or not len(mesh.triangles):
         return
     if faces_inwards(mesh):
-        notes.append(
-            f"shape '{mesh.name}': faces point inwards: from outside its vertices will be black "
-            "(set flip_normals, or use a twosided BSDF, if that is not meant)"
-        )
+        notes.add(mesh.name, _FACES_INWARDS)
 
 
 def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> float:
@@ -114,18 +153,13 @@ def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> fl
 
 
 def _tessellate(where: PlacedShape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
-    """Triangles of a shape that has none, in world space or that of its group; an unknown one is refused."""
+    """Triangles of a shape that has none, in world space or that of its group."""
     shape, edge_length = where.shape, edge_length / where.largest_scale
     if shape.class_name() in ("BSplineCurve", "LinearCurve"):
         return curve_mesh(shape, edge_length, where.name, limit)
     if shape.class_name() == "Ellipsoids":
         return ellipsoids_mesh(shape, edge_length, where.name, limit)
-    kind = {"Sphere": "sphere", "Disk": "disk", "Cylinder": "cylinder"}.get(shape.class_name())
-    if kind is None:
-        raise PrtError(
-            f"shape '{material.name}' is of type {shape.class_name()}, which is not made of triangles: "
-            "replace it by a mesh (ply, obj)"
-        )
+    kind = shape.class_name().lower()
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
     mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
@@ -140,7 +174,7 @@ def _tessellate(where: PlacedShape, material: Material, edge_length: float, limi
     )
 
 
-def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
+def _clean_mesh(shape: mi.Mesh, name: str, notes: Notes) -> TriangleMesh:
     """A Mitsuba mesh as clean triangles in world space, with the normals that Mitsuba shades with."""
     mesh = read_mesh(shape, name)
     check_geometry(mesh)
@@ -148,17 +182,15 @@ def _clean_mesh(shape: mi.Mesh, name: str, notes: list[str]) -> TriangleMesh:
         mesh = stabilise_normals(mesh, _recomputed_normals(mesh))
     mesh, dropped = drop_degenerate(mesh)
     if dropped:
-        notes.append(f"shape '{name}': {dropped} triangles without area are left out")
+        notes.add(name, _NO_AREA, dropped)
     mesh, dropped = drop_unreferenced(mesh)
     if dropped:
-        notes.append(f"shape '{name}': {dropped} vertices that no triangle uses are left out")
+        notes.add(name, _NO_TRIANGLE, dropped)
     if mesh.normals is None:  # Mitsuba shades such meshes flat
         mesh = split_by_face(mesh)
     mesh, zero = make_unit_normals(mesh)
     if zero:
-        notes.append(
-            f"shape '{name}': {zero} vertices have a normal of length zero; it is computed from their faces"
-        )
+        notes.add(name, _NO_NORMAL, zero)
     return flip_sides(mesh) if shape.has_flipped_normals() else mesh
 
 

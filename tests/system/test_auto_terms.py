@@ -121,8 +121,11 @@ def test_beside_mirror_and_mask():
 def test_what_cannot_be_factored_is_named(tmp_path):
     """By the integrator, whose default it is: one warning, an image, and the metal beside it has its factors."""
     weight = {"type": "checkerboard", "to_uv": T().scale(4)}
-    blend = {"type": "blendbsdf", "weight": weight, "metal": BRUSHED, "paint": diffuse(0.5, 0.1, 0.1)}
-    scene = scene_of(0.3, metal=ball(0.4, BRUSHED), quilt=ball(-0.5, blend))
+    red, blue = (
+        {"type": "blendbsdf", "weight": weight, "metal": BRUSHED, "paint": diffuse(*rgb)}
+        for rgb in ((0.5, 0.1, 0.1), (0.1, 0.1, 0.5))
+    )
+    scene = scene_of(0.3, metal=ball(0.4, BRUSHED), quilt=ball(-0.5, red), rug=ball(-1.5, blue))
     integrator = mi.load_dict(
         {"type": "sparse_prt", "resolution": 4, "max_depth": 2, "cache": str(tmp_path), "progress": False}
     )
@@ -132,7 +135,8 @@ def test_what_cannot_be_factored_is_named(tmp_path):
     said = [str(w.message) for w in caught if "diffuse" in str(w.message)]
     assert len(said) == 1
     assert (
-        "'quilt' (BlendBSDF varies over the surface" in said[0] and "estimated error does not know" in said[0]
+        "'quilt', 'rug' (BlendBSDF varies over the surface" in said[0]
+        and "estimated error does not know" in said[0]
     )
     assert np.isfinite(image).all() and image.mean() > 0.1
     (file,) = tmp_path.glob("*.prt")

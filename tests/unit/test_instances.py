@@ -88,6 +88,31 @@ def test_instances_become_one_mesh_for_each_bsdf() -> None:
     check_hits(original, scene, missed=0.01, off=1e-3, textured=False)  # constant BSDFs need no coordinates
 
 
+@pytest.mark.parametrize("named", ["shapes", "groups", "both together"])
+def test_equal_names_are_not_taken_for_each_other(named: str) -> None:
+    """Two groups whose shapes have the same id, that have the same id themselves, or that lead to the same name."""
+    dark, light = ({"type": "rectangle", "bsdf": diffuse(v, v, v)} for v in (0.1, 0.9))
+    names = ("a", "body"), ("a", "body") if named == "groups" else ("b", "body")
+    if named == "both together":
+        names = ("a", "b_body"), ("a_b", "body")
+    groups = [
+        mi.load_dict({"type": "shapegroup", of: shape})
+        for (_, of), shape in zip(names, (dark, light), strict=True)
+    ]
+    away = {"type": "instance", "to_world": T().translate([5, 0, 0])}
+    content = {"one": {"type": "instance", names[0][0]: groups[0]}, "other": away | {names[1][0]: groups[1]}}
+    original = mi.load_dict({"type": "scene", "g": groups[0], "h": groups[1], **content})
+    ids = [group.id() for group in groups]
+    scene = Scene.from_mitsuba(original, float("inf"))
+    assert [group.id() for group in groups] == ids
+    assert ids == [name for name, _ in names]
+    assert len({mesh.name for mesh in scene.meshes}) == len(scene.meshes) == 2
+    there = scene.positions[:, 0] > 2
+    np.testing.assert_allclose(scene.albedo[~there], 0.1, atol=1e-6)
+    np.testing.assert_allclose(scene.albedo[there], 0.9, atol=1e-6)
+    assert np.sum(there) == np.sum(~there) == 4
+
+
 def test_merged_instances_cost_what_their_triangles_cost() -> None:
     """A matrix of instances is that of the same triangles loaded as one mesh per BSDF."""
     scene = Scene.from_mitsuba(mi.load_dict(bricks(6)), 1.0)

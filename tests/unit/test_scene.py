@@ -1,6 +1,7 @@
 """Loading: vertices, normals, albedo, the unit-box copy, hashes, and what is refused."""
 
 import itertools
+import re
 import runpy
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import mi_sparse_prt  # noqa: F401  chooses the variant
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.measurement.measurement import mesh_vertices
+from mi_sparse_prt.scene import surfaces
 from mi_sparse_prt.scene.loading import load_scene
 from mi_sparse_prt.scene.mesh_cleaning import check_geometry
 from mi_sparse_prt.scene.scene import Scene
@@ -577,6 +579,61 @@ def test_bare_mesh_gets_normals_and_loses_what_is_useless(tmp_path: Path) -> Non
     ]
     np.testing.assert_array_equal(scene.positions, SQUARE)
     np.testing.assert_array_equal(scene.normals, np.tile([0, 0, 1], (4, 1)))
+
+
+def test_what_many_shapes_have_in_common_is_said_once() -> None:
+    plastic, gold = {"type": "roughplastic"}, {"type": "roughconductor", "material": "Au"}
+    medium = {"type": "homogeneous", "albedo": 0.5}
+    inside_out = {"type": "sphere", "flip_normals": True, "bsdf": gold}
+    shapes: dict = {f"p{k}": {"type": "rectangle", "bsdf": plastic} for k in range(5)}
+    shapes |= {f"g{k}": inside_out for k in range(2)}
+    shapes |= {f"l{k}": {"type": "disk", "emitter": {"type": "area"}} for k in range(4)}
+    shapes |= {f"m{k}": {"type": "cube", "interior": medium} for k in range(2)}
+    original = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    with pytest.warns(PrtWarning) as caught:
+        scene = Scene.from_mitsuba(original, INF)
+    assert [str(w.message) for w in caught] == scene.warnings
+    begins = [
+        "shapes 'p0', 'p1', 'p2' and 2 more: BSDF RoughPlastic is not diffuse; a matrix treats their vertices",
+        "shapes 'g0', 'g1': BSDF RoughConductor is not diffuse; a matrix treats their vertices as diffuse",
+        "shapes 'l0', 'l1', 'l2' and 1 more are area emitters: matrices of lamps (SceneEmitters) have their",
+        "shapes 'm0', 'm1' bound media: these are left out",
+        "shapes 'g0', 'g1': faces point inwards: from outside their vertices will be black",
+    ]
+    assert len(scene.warnings) == len(begins)
+    assert all(said.startswith(begin) for said, begin in zip(scene.warnings, begins, strict=True))
+
+
+def test_cameras_and_lamps_in_media_are_named() -> None:
+    fog = {"type": "homogeneous"}
+    lamps = {f"lamp{k}": {"type": "point", "medium": fog} for k in range(2)}
+    camera = {"type": "perspective", "medium": fog}
+    original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "eye": camera, **lamps})
+    with pytest.warns(PrtWarning) as caught:
+        Scene.from_mitsuba(original, INF)
+    eye, both = sorted((str(w.message) for w in caught), reverse=True)
+    assert eye.startswith("sensor 'eye' is inside a medium: media are left out")
+    assert re.match("emitters 'lamp.', 'lamp.' are inside media: media are left out", both)
+
+
+def test_what_cannot_be_used_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surfaces, "_clean_mesh", lambda *_: pytest.fail("a mesh was read"))
+    blob = {"type": "sdfgrid", "filename": str(SCENES / "zoo/blob.vol")}
+    original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "a": blob, "b": blob})
+    with pytest.raises(PrtError, match=r"^shapes '.', '.' are of type SDFGrid.*replace them by a mesh"):
+        Scene.from_mitsuba(original, INF)
+
+
+def test_what_is_left_out_of_many_shapes_is_added_up(tmp_path: Path) -> None:
+    write_ply(tmp_path / "part.ply", [*SQUARE, [5, 5, 5]], [[0, 1, 2], [0, 2, 3], [1, 1, 2]])
+    shape = '<shape type="ply" id="{}"><string name="filename" value="part.ply"/></shape>'
+    content = shape.format("a") + shape.format("b")
+    with pytest.warns(PrtWarning):
+        scene = load_scene(write_xml(tmp_path / "x.xml", content), INF)
+    assert scene.warnings == [
+        "shapes 'a', 'b': 2 triangles without area are left out",
+        "shapes 'a', 'b': 2 vertices that no triangle uses are left out",
+    ]
 
 
 def test_duplicate_vertices_are_kept(tmp_path: Path) -> None:

@@ -137,3 +137,24 @@ def test_an_llvm_that_aborts_is_refused_before_it_can():
     assert last.startswith("mi_sparse_prt.core.errors.PrtError: libLLVM 1")
     assert str(old[0]) in last
     assert "export DRJIT_LIBLLVM_PATH" in last or "apt-get install libllvm19" in last
+
+
+@pytest.mark.parametrize("other", ["scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
+def test_variants_that_are_set_later_are_refused_by_name(other, tmp_path):
+    """A file is not loaded there, and the integrator says where it works instead of not being found."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text('<scene version="3.0.0"><integrator type="sparse_prt"/></scene>')
+    done = run_python(
+        "import mi_sparse_prt as prt, mitsuba as mi\n"
+        f"mi.set_variant({other!r})\n"
+        f"for load in prt.load_scene, mi.load_file:\n    try:\n        load({str(scene)!r})\n"
+        "    except Exception as error:\n        print(str(error).splitlines()[-1])\n"
+        "mi.set_variant('llvm_ad_rgb')\nprint(type(mi.load_dict({'type': 'sparse_prt'})).__name__)",
+        MI_SPARSE_PRT_VARIANT="llvm_ad_rgb",
+    )
+    assert done.stdout.splitlines() == [
+        f"variant {other} is not supported: use llvm_ad_rgb or cuda_ad_rgb",
+        f"PrtError: plugins of mi_sparse_prt are those of llvm_ad_rgb, not of {other}: "
+        "call mitsuba.set_variant('llvm_ad_rgb')",
+        "SparsePRT",
+    ]

@@ -21,6 +21,7 @@ from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid
 from mi_sparse_prt.reflection.brdf_factors.factor_error import FactorError, measure_factor_error
 from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, BrdfFactors, factor_brdf
 from mi_sparse_prt.scene.materials import Material
+from mi_sparse_prt.scene.notes import Notes
 
 FORMAT = 2  # of the files; another one whenever factors of the same BSDF would be others
 
@@ -146,7 +147,7 @@ def _find_or_make(
 def _key(bsdf: mi.BSDF, name: str, options: FactorOptions) -> str:
     """Of all that the BSDF shows, and of some values, as plugins may show too little of themselves."""
     carrier = mi.load_dict({"type": "rectangle", "bsdf": bsdf})  # what materials are read from
-    shown = Material(carrier, name, []).digest()
+    shown = Material(carrier, name, Notes()).digest()
     made_with = [FORMAT, MOST_TERMS, options.grid.heights, options.grid.azimuths, options.pairs]
     state = hashlib.sha256(json.dumps(made_with).encode())
     state.update(shown + evaluate_brdf(bsdf, name, *probe_directions()).tobytes())
