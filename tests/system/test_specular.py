@@ -178,6 +178,24 @@ def test_where_nothing_is_lost_on_the_way_nothing_is_sampled():
     )
 
 
+@pytest.mark.parametrize(("resolution", "depth"), [(1, 5), (4, 5), (4, -1)])
+def test_bits_and_what_passes_are_told_by_the_same_rays(resolution, depth):
+    """As rays for each alone tell them; also where rows are no whole words, and without a depth."""
+    scene, lighting = build(0.5, **objects(0.6)), prt.CubemapLighting(resolution)
+    problem = replace(problem_at(scene, lighting, max_depth=depth), specular_apart=True)
+    direct, n = DirectSolver(problem), lighting.n_directions
+    bits, passed = direct.rows_and_passed(IDS)
+    assert np.array_equal(bits, direct.rows(IDS))
+    alone = direct.partly_passed(np.repeat(IDS, n), np.tile(np.arange(n), len(IDS)))
+    assert len(passed.elements) and np.array_equal(passed.elements, alone.elements)
+    assert passed.values.shape[1] == max(problem.depths_apart, 1)
+    assert passed.values == pytest.approx(alone.values, rel=1e-5)
+    if resolution == 4 and depth == 5:
+        fine = replace(problem, emission=prt.CubemapLighting(16), basis="texel")
+        found = specular_light(fine, 0, SpecularOptions(), IDS)
+        assert np.array_equal(found.seen, DirectSolver(replace(fine, basis="direction")).rows(IDS))
+
+
 def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
     scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)

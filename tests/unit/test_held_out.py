@@ -12,7 +12,7 @@ from conftest import mesh as mesh_of
 import mi_sparse_prt as prt
 from mi_sparse_prt.estimation import element_sampling, held_out
 from mi_sparse_prt.estimation.element_sampling import Effort, for_direct_light, for_indirect_light
-from mi_sparse_prt.estimation.held_out import Sample, relative
+from mi_sparse_prt.estimation.held_out import Sample, estimate_errors, relative
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.interpolated import Interpolated
@@ -336,6 +336,8 @@ def test_parts_with_elements_of_their_own():
     direct = row_sample(np.full(50, 2.0), np.full(50, 0.03), np.full(50, 0.9))
     indirect = row_sample(np.full(10, 10.0), np.full(10, 0.01), np.full(10, 0.1))
     assert relative([direct, indirect])[0] == pytest.approx(0.2)
+    parts = estimate_errors({("a", "direct"): direct, ("a", "indirect"): indirect}).parts
+    assert parts == pytest.approx({"direct": 0.03**0.5, "indirect": 0.1})
 
 
 @pytest.mark.parametrize("n", [80, 8192])
