@@ -214,6 +214,8 @@ def _project_emitter(emitter: mi.Emitter, lighting: CubemapLighting) -> NDArray[
             f"emitter {emitter.class_name()} is not an environment: it does not shine from infinity"
         )
     n, texels = lighting.resolution, np.arange(lighting.n_directions)
+    if emitter.class_name() == "ConstantBackgroundEmitter":  # the same in all directions
+        return np.repeat(_sampled(emitter, texels[:1], n, 1)[0], len(texels), axis=0).astype(np.float32)
     if (s := _samples_per_edge(emitter, n)) is not None:
         return _sampled(emitter, texels, n, s)[0].astype(np.float32)
     return _project_formula(emitter, lighting).astype(np.float32)
