@@ -22,6 +22,7 @@ from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinati
 from mi_sparse_prt.operators.operator import Operator
 
 PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
+ROWS = 1 << 12  # of blocks of columns that are side by side at a time: a few megabytes
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -127,7 +128,7 @@ def first_bounce(
     columns, turn, missed = _basis(matrix, albedo, direct, hashes, rng, tolerance, options)
     count = options.row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
-    some = columns[rows].astype(np.float64) @ turn
+    some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
     right = [fit @ known for known in _rows(matrix[rows], albedo, direct)]
@@ -142,8 +143,11 @@ def _basis(
     rng: np.random.Generator,
     tolerance: float,
     options: RandomBasis,
-) -> tuple[Floats, Doubles, float]:
-    """Combinations Y (n, m) of the columns of all channels; turn (m, r), which makes them a basis; what that misses.
+) -> tuple[list[Floats], Doubles, float]:
+    """Combinations Y of the columns of all channels; turn (m, r), which makes them a basis; what that misses.
+
+    Y (n, m) comes in blocks of columns: side by side they would be as many new pages, which cost more than the numbers
+    in them.
 
     Random combinations have, on average, the energy of all columns: each block of them measures what the basis misses
     before it joins (Halko et al. 2011, 4.3). Gram and Schmidt see random sums of rows only, by which lengths and
@@ -167,7 +171,7 @@ def _basis(
         squares, vectors = np.linalg.eigh(rest)
         kept = squares > (PRECISION / 2) ** 2 * energy
         if missed <= options.share * tolerance**2 or not kept.any() or len(known) >= options.most:
-            return np.hstack([*blocks, block[:, :0]]), turn, missed
+            return blocks or [block[:, :0]], turn, missed
         steps = vectors[:, kept] / np.sqrt(squares[kept])
         turn = np.block([[turn, -turn @ (known @ steps)], [np.zeros((len(steps), turn.shape[1])), steps]])
         blocks.append(block)
@@ -196,13 +200,26 @@ def _combinations(
     for rho in albedo:
         mixed = np.hstack([random_combinations(direct, options.mixed, rng) for _ in range(draws)])
         found.append(multiply_scaled(matrix, rho[None], mixed)[0])
-    return found[0] if len(found) == 1 else np.hstack(found)  # new pages cost more than the numbers in them
+    return found[0] if len(found) == 1 else np.hstack(found)
 
 
-def _leverage(columns: Floats, turn: Doubles, projections: int, rng: np.random.Generator) -> Doubles:
+def _leverage(columns: list[Floats], turn: Doubles, projections: int, rng: np.random.Generator) -> Doubles:
     """Squared norms (n,) of the rows of the basis, about: from random projections."""
     projection = turn @ rng.standard_normal((turn.shape[1], projections))
-    return np.square(columns @ projection.astype(np.float32)).sum(axis=1, dtype=np.float64)
+    projected = _products(columns, [projection.astype(np.float32)])[0]
+    return np.square(projected).sum(axis=1, dtype=np.float64)
+
+
+def _products(columns: list[Floats], factors: Sequence[Floats]) -> list[Floats]:
+    """Blocks of columns, side by side, times matrices: some rows at a time."""
+    n = len(columns[0])
+    results = [np.empty((n, factor.shape[1]), np.float32) for factor in factors]
+    for a in range(0, n, ROWS):
+        rows = slice(a, a + ROWS)
+        some = np.hstack([block[rows] for block in columns])
+        for result, factor in zip(results, factors, strict=True):
+            np.matmul(some, factor, out=result[rows])
+    return results
 
 
 def _chosen_rows(
@@ -238,7 +255,7 @@ def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator) -> F
 
 
 def _truncated(
-    columns: Floats, turn: Doubles, right: list[Floats], missed: float, tolerance: float
+    columns: list[Floats], turn: Doubles, right: list[Floats], missed: float, tolerance: float
 ) -> FirstBounce:
     """In terms of singular vectors, the least of them left out, as far as the tolerance allows."""
     parts = [np.linalg.eigh(b.astype(np.float64) @ b.T.astype(np.float64)) for b in right]
@@ -248,7 +265,7 @@ def _truncated(
     turns = [u[:, ::-1][:, k].astype(np.float32) for (_, u), k in zip(parts, kept, strict=True)]
     dropped = sum(float(s[~k].sum()) for s, k in zip(squares, kept, strict=True))
     return FirstBounce(
-        tuple(columns @ (turn @ u).astype(np.float32) for u in turns),
+        tuple(_products(columns, [(turn @ u).astype(np.float32) for u in turns])),
         tuple(u.T @ b for u, b in zip(turns, right, strict=True)),
         float(np.sqrt(missed + dropped / max(energy, 1e-30))),
     )
