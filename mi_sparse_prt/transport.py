@@ -24,7 +24,6 @@ from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.io.store import write_store
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.stored import operator_arrays
 from mi_sparse_prt.operators.sum import Sum, add
@@ -248,7 +247,7 @@ class LightTransport:
         """Light (k, rows, 3) that met at most 0, 1, ... surfaces."""
         known, found = self.emission.project(lighting), dict[int, list[Floats]]()
         for operator in self.operators.values():
-            terms = enumerate(operator.terms, 1) if isinstance(operator, ByDepth) else [(0, operator)]
+            terms = enumerate(operator.by_depth, 1) if operator.by_depth else [(0, operator)]
             for depth, term in terms:
                 found.setdefault(depth, []).append(term.relight(known))
         return np.cumsum([add(found[depth]) for depth in sorted(found)], axis=0)

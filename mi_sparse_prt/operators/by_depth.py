@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.operators.operator import Ids, Operator
 from mi_sparse_prt.operators.sum import Sum
 
 
@@ -22,6 +22,10 @@ class ByDepth(Sum):
     """
 
     kind: ClassVar[str] = "by_depth"
+
+    @property
+    def by_depth(self) -> tuple[Operator, ...]:
+        return self.terms
 
     def take(self, ids: Ids) -> ByDepth:
         return ByDepth(tuple(term.take(ids) for term in self.terms))

@@ -108,6 +108,11 @@ class Operator(ABC):
         """Bits (rows, words) of the texels' centres that are seen, if it has any: errors lie along their edges."""
         return None
 
+    @property
+    def by_depth(self) -> tuple[Operator, ...]:
+        """Of light that met 1, 2, ... surfaces before it arrived, where it is told apart; the sum is this one."""
+        return ()
+
     def columns(self, ids: Ids) -> Floats:
         """Columns (rows, len(ids), channels)."""
         ids = np.asarray(ids)

@@ -249,8 +249,8 @@ class FiniteElements:
             The latter if ``specular`` is told apart by depth.
         """
         direct = self._lit(direct)
-        if isinstance(specular, ByDepth):
-            return self._by_depth((direct, *specular.terms[:-1]), tolerance)
+        if specular is not None and specular.by_depth:
+            return self._by_depth((direct, *specular.by_depth[:-1]), tolerance)
         if specular is not None:
             direct = Sum((direct, specular))
         count = self._count_for(direct)
@@ -483,7 +483,7 @@ class RadiositySolver(FiniteElements):
         lit = self._lit(direct)
         lit = lit if specular is None else Sum((lit, specular))
         first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
-        specular = Sum(specular.terms) if isinstance(specular, ByDepth) else specular
+        specular = Sum(specular.by_depth) if specular is not None and specular.by_depth else specular
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
         assert isinstance(before, Gathered)
         again = [
