@@ -92,7 +92,7 @@ def consensus_cost(
     power = (scene.albedo[ids] ** 2).sum(axis=1) * stands_for
     exact = direct.rows(ids.astype(np.uint32)).astype(np.uint32, copy=False)
     wrong, all_of_it = (float(power @ _energy(direct, ids, bits)) for bits in (exact ^ seen, exact))
-    return DirectCost(seconds, held.share(held.direct) * math.sqrt(wrong / max(all_of_it, 1e-300)))
+    return DirectCost(seconds, held.direct_share * math.sqrt(wrong / max(all_of_it, 1e-300)))
 
 
 def _patches(
