@@ -17,6 +17,7 @@ from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.space import SampledEmission
+from mi_sparse_prt.estimation.darkness import DARK
 from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
@@ -205,7 +206,7 @@ class _Attempts:
             error = held_out_error(self._judged, transport, run.seed)
         _warn_if_missed(error, self._settings, self._proposals.too_long)
         transport.report.update(
-            _account(parts, problem, _skipped(problem.scene, self._dark))
+            _account(parts, problem, _skipped(problem.scene, self._dark, error))
             | {"estimated_error": error.report(), "plans": self._proposals.report()}
             | {"forecast": expected._asdict(), "plan": plan.report()}
             | _costs(transport, run.clock)
@@ -246,7 +247,9 @@ class _Attempts:
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
                 found = held_out_error(self._judged, transport, stream, target)
             errors.append(found.total)
-            if found.total <= target or not proposals.after(found, self._run.clock.report()["total"]):
+            if found.total <= target or found.dark:
+                break
+            if not proposals.after(found, self._run.clock.report()["total"]):
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))
@@ -349,11 +352,18 @@ def _no_indirect(problem: Problem, settings: Settings, clock: Stopwatch) -> str 
     return None if surfaces_meet else "no surface sees another one"
 
 
-def _skipped(scene: Scene, reason: str | None) -> list[str]:
-    """What of the indirect light is left out."""
+def _skipped(scene: Scene, reason: str | None, error: HeldOutError) -> list[str]:
+    """What of the indirect light, and of what would make the matrix more exact, is left out."""
+    left_out = []
     if reason is not None:
-        return [f"indirect light: {reason}"]
-    return ["two of three channels of the indirect light: every surface is grey"] if scene.grey else []
+        left_out.append(f"indirect light: {reason}")
+    elif scene.grey:
+        left_out.append("two of three channels of the indirect light: every surface is grey")
+    if error.dark:
+        left_out.append(
+            f"a more exact matrix: next to no light arrives, less than {DARK:.0%} of an unoccluded scene's"
+        )
+    return left_out
 
 
 def _proposals(
@@ -400,7 +410,7 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
     target, asked = settings.target_error, settings.target_error is not None
     if settings.method == "auto" and target is None and not settings.view_dependent:
         target = WORST_FACTOR * TARGET
-    if target is None or error.total - 2 * error.standard_error["total"] <= target:
+    if target is None or error.dark or error.total - 2 * error.standard_error["total"] <= target:
         return
     more = ""
     if too_long is not None:

@@ -13,13 +13,14 @@ mean, (S - m)^2 - v estimates (S - s)^2.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.estimation.darkness import DARK, unoccluded_squares
 from mi_sparse_prt.estimation.element_sampling import (
     Chosen,
     Effort,
@@ -85,6 +86,8 @@ class HeldOutError:
         What ``"direct"``, ``"indirect"`` and ``"specular"`` light add to `total`: their squares sum up to its square.
     terms : list of float
         Of glossy scenes: of each term's rows.
+    dark : bool
+        Whether next to no light arrives (``darkness``): errors relative to it do not count.
     """
 
     total: float
@@ -93,6 +96,7 @@ class HeldOutError:
     elements: int
     parts: dict[str, float]
     terms: list[float]
+    dark: bool = False
 
     def report(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -123,15 +127,17 @@ def held_out_error(
     """
     stream = random_stream(seed, HELD_OUT)
     estimator, rng = _Estimator(problem, transport, effort, stream), np.random.default_rng(stream)
+    open_square = float(unoccluded_squares(problem.reflection.albedo, problem.emission).sum())
     if target is None:
-        return estimate_errors(estimator.samples(rng, 1.0))
-    samples: Samples = {}
-    for _ in range(round(1 / ROUND)):
-        samples = _together(samples, estimator.samples(rng, ROUND))
+        samples = estimator.samples(rng, 1.0)
+        return replace(estimate_errors(samples), dark=_squared_norm(samples) < DARK**2 * open_square)
+    samples, rounds = {}, 0
+    while rounds < round(1 / ROUND):
+        samples, rounds = _together(samples, estimator.samples(rng, ROUND)), rounds + 1
         found = estimate_errors(samples)
         if abs(found.total - target) > 2 * found.standard_error["total"]:
             break
-    return found
+    return replace(found, dark=_squared_norm(samples) < rounds * DARK**2 * open_square)
 
 
 def _together(first: Samples, second: Samples) -> Samples:
@@ -164,11 +170,16 @@ def estimate_errors(samples: Samples) -> HeldOutError:
 
 def _shares(samples: Samples) -> dict[str, float]:
     """Relative L2 error that each part adds; 0 where its square is noise about 0."""
-    norm = sum(float(s.weights @ s.norms[:, 0]) for s in samples.values())
+    norm = _squared_norm(samples)
     squares = dict.fromkeys((part for _, part in samples), 0.0)
     for (_, part), s in samples.items():
         squares[part] += float(s.weights @ s.squares[:, 0])
     return {part: float(np.sqrt(max(square, 0.0) / max(norm, 1e-300))) for part, square in squares.items()}
+
+
+def _squared_norm(samples: Samples) -> float:
+    """Of the matrix's radiance, times how often the samples stand for all of it."""
+    return sum(float(s.weights @ s.norms[:, 0]) for s in samples.values())
 
 
 def _pooled(samples: Samples) -> list[Sample]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.estimation.darkness import unoccluded_squares
 from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -18,6 +19,7 @@ from mi_sparse_prt.solvers.problem import Problem
 PILOT = 2  # spawn key
 SPP = 64
 STRATA = 4  # shadow rays per axis of a texel
+DIM = 0.1  # of unoccluded light, below which elements may miss most: a hole in a wall is a texel or two of a row
 
 Values = NDArray[np.floating]
 
@@ -104,6 +106,11 @@ class PilotElements:
         self.indirect = self.paths(problem.max_depth) if indirect else None
         whole = self.direct.values + (self.indirect.values if self.indirect else 0)
         self._norm = self._total(self._squares(*whole))
+        self._direct_norm = self._total(self._squares(*self.direct.values))
+        if self.light() < DIM:
+            exact = self._direct_norm_of_rows()
+            self._norm += exact - self._direct_norm
+            self._direct_norm = exact
 
     def paths(self, max_depth: int, spp: int = SPP) -> Halves:
         """Indirect light at these elements, up to some depth."""
@@ -132,6 +139,16 @@ class PilotElements:
         x, y = self._albedo * (self.direct.values + (self.indirect.values if self.indirect else 0))
         return ((elements - x) * (elements - y)).sum(axis=2)
 
+    def light(self) -> float:
+        """Norm of the matrix relative to what it would be if nothing was in the way."""
+        rows = unoccluded_squares(self._albedo[:, 0], self.lighting) / self.lighting.n_directions
+        return math.sqrt(max(self._norm, 0.0) / max(float(self.stand_for @ rows), 1e-300))
+
+    @property
+    def direct_share(self) -> float:
+        """Norm of direct light relative to that of the whole matrix."""
+        return math.sqrt(max(self._direct_norm, 0.0) / max(self._norm, 1e-300))
+
     def error_of(self, part: Halves, unit_albedo: Values) -> NDArray[np.float64]:
         """What a part's unit-albedo transport (k, t, channels) adds to the squared errors (k, t), without bias."""
         return self._squares(*(unit_albedo - part.values))
@@ -151,6 +168,13 @@ class PilotElements:
         )
         values = np.stack([first, second]).astype(np.float64)
         return Halves(values, np.zeros_like(values[0]))
+
+    def _direct_norm_of_rows(self) -> float:
+        """As of the elements, but from all texels."""
+        count = self.lighting.n_directions
+        asked = np.repeat(self.vertices, count), np.tile(np.arange(count), len(self.vertices))
+        rows = DirectSolver(self.problem).elements(*asked).reshape(-1, count, 1)
+        return self._total(self._squares(rows, rows))
 
     @property
     def _flat(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -9,6 +9,7 @@ from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.walls import Walls
 
 
 def by_consensus(direct: DirectSolver, run: Run) -> Consensus:
@@ -33,7 +34,8 @@ def by_consensus(direct: DirectSolver, run: Run) -> Consensus:
                 return direct.visible(vertices, texels)
 
         state = Consensus(scene.normals, AngularGrid(direct.lighting), trace)
+        walls = Walls(scene, direct.points)
         for at in scene.sampled_together:
             positions, normals = scene.normalised_positions[at], scene.normals[at]
-            sample_by_levels(state, Surface(at.start, positions, normals, keys[at]))
+            sample_by_levels(state, Surface(at.start, positions, normals, keys[at]), walls.leave_fewer)
     return state

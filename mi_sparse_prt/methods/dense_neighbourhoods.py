@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.measurement.neighbours import Neighbours, renumber, surface_neighbours
 from mi_sparse_prt.methods.dense_sampling import Dense, DenseSampler
 from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.solvers.walls import Walls
 
 NEIGHBOURS = 12  # dense ones
 AROUND = 12  # of all vertices
@@ -43,11 +44,12 @@ class Neighbourhood:
 
 
 def neighbourhoods(sampler: DenseSampler) -> tuple[Dense, list[Neighbourhood]]:
-    """Dense neighbours of all sparse vertices; vertices with too few on their own surface become dense first."""
+    """Dense neighbours of all sparse vertices; vertices with too few within reach become dense first."""
     scene, clock, dense = sampler.scene, sampler.run.clock, sampler.dense()
     with clock.phase("neighbours"):
         groups = [_neighbourhood(scene, dense, mesh) for mesh in scene.meshes]
-        few = [g.sparse[(g.near_sparse >= 0).sum(axis=1) < LEAST_NEIGHBOURS] for g in groups]
+        walls = Walls(scene, sampler.direct.points)
+        few = [group.sparse[_lonely(walls, group, dense)] for group in groups]
     lonely = np.concatenate(few)
     if not len(lonely):
         return dense, groups
@@ -62,6 +64,12 @@ def neighbourhoods(sampler: DenseSampler) -> tuple[Dense, list[Neighbourhood]]:
                 ids = np.where(group.near.ids >= 0, group.near.ids + np.int32(shift), -1)
                 groups[number] = replace(group, near=replace(group.near, ids=ids))
     return more, groups
+
+
+def _lonely(walls: Walls, group: Neighbourhood, dense: Dense) -> NDArray[np.bool_]:
+    """Sparse vertices (n_sparse,) with too few neighbours, or none on their side of walls."""
+    near = group.dense_around_sparse(dense)
+    return ((near >= 0).sum(axis=1) < LEAST_NEIGHBOURS) | walls.leave_fewer(1, group.sparse, near)
 
 
 def _neighbourhood(scene: Scene, dense: Dense, mesh: Mesh) -> Neighbourhood:

@@ -31,6 +31,7 @@ from mi_sparse_prt.reconstruction.ridge import System, choose_deviation, fit_cor
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.walls import Walls
 
 BLOCK = 4096  # sparse vertices at a time
 
@@ -86,7 +87,8 @@ def indirect_part(
     """
     scene = solver.problem.scene
     with run.clock.phase("solver"):
-        priors = [_prior(scene, group, dense, options.neighbours) for group in groups]
+        walls = Walls(scene, solver.points)
+        priors = [_prior(scene, walls, group, dense, options.neighbours) for group in groups]
     density, noise, kept = _dense_rows(solver, dense, groups, priors, grid, run)
     fit = _Fit(solver, density, noise, evaluated, grid, run, options)
     counts, columns, values = [], [], []
@@ -172,11 +174,12 @@ def _with_sums_of(
 
 
 def _prior(
-    scene: Scene, group: Neighbourhood, dense: Dense, count: int
+    scene: Scene, walls: Walls, group: Neighbourhood, dense: Dense, count: int
 ) -> tuple[Neighbours, NDArray[np.float32]]:
-    """Neighbours and weights (n, k) of all vertices of a mesh, the dense ones among them."""
+    """Neighbours and weights (n, k) of all vertices of a mesh, the dense ones among them; none behind walls."""
     p, n, inside = scene.normalised_positions, scene.normals, group.mesh.vertices
-    near = Neighbours(group.near.ids[:, :count], group.near.distances[:, :count])
+    near = walls.without_hidden(np.arange(inside.start, inside.stop), group.near, dense.ids)
+    near = Neighbours(near.ids[:, :count], near.distances[:, :count])
     return near, linear_weights(near, p[inside], n[inside], p[dense.ids], n[dense.ids])
 
 

@@ -78,7 +78,7 @@ class CandidatePlans:
     Notes
     -----
     Of ``"auto"``, plans that are predicted to take longer than ``max_seconds`` are not carried out; if all do, the
-    quickest one is the present one.
+    quickest one is the present one. Where next to no light arrives, the quickest one is good enough.
     """
 
     too_long: Predicted | None = None
@@ -91,11 +91,13 @@ class CandidatePlans:
     def _rank(self, costs: Costs) -> None:
         settings, target = self._settings, self._settings.target_error
         self._costs = costs
-        self._plans = predictions(costs, target or TARGET, settings.spp)
+        # as many paths as without a target, where it is one of next to nothing
+        spp = settings.samples if costs.dark else settings.spp
+        self._plans = predictions(costs, target or TARGET, spp)
         # errors of paths are predicted too well for a first attempt to turn out better
         begin = choose_first if settings.method == "auto" else choose
         within = [p for p in self._plans if p.seconds <= self._limit] or self._plans[:1]
-        self._best = begin(within, target)
+        self._best = within[0] if costs.dark else begin(within, target)
         self._tried, self._found = [self._best], list[tuple[Plan, float]]()
         wished, aim = choose(self._plans, target or TARGET), target or TARGET
         self.too_long = wished if wished.error <= aim < min(p.error for p in within) else None

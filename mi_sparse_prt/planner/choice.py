@@ -50,6 +50,8 @@ class Costs:
         Norm of direct light relative to that of the whole matrix.
     specular : float
         Relative error that light by way of mirrors and glass adds to every plan.
+    dark : bool
+        Whether next to no light arrives: errors relative to it do not count.
     """
 
     fixed: float
@@ -60,6 +62,7 @@ class Costs:
     direct_share: float = 1.0
     check: float = 0.0
     specular: float = 0.0
+    dark: bool = False
 
 
 @dataclass(frozen=True)
@@ -174,6 +177,8 @@ def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str
 
     It costs little to find beside all rays, and then its error is known.
     """
+    if costs.dark:
+        return None
     for name in costs.direct:
         if name == "exact":
             continue

@@ -20,6 +20,7 @@ from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_level
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
+from mi_sparse_prt.solvers.walls import Walls
 
 PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
@@ -81,10 +82,11 @@ def consensus_cost(
         AngularGrid(direct.lighting),
         lambda vertices, texels: direct.visible(ids[vertices].astype(np.uint32), texels),
     )
-    first = 0
+    first, walls = 0, Walls(scene, points_at(direct.points, ids))
     for patch in patches:
         p = scene.normalised_positions[patch]
-        sample_by_levels(state, Surface(first, p, scene.normals[patch], direct.points.keys[patch]))
+        surface = Surface(first, p, scene.normals[patch], direct.points.keys[patch])
+        sample_by_levels(state, surface, walls.leave_fewer)
         first += len(patch)
     asked, seen, ids = state.evaluated[inner], state.visible[inner], ids[inner]
     rays = float(stands_for @ count_bits(asked))
@@ -92,7 +94,7 @@ def consensus_cost(
     power = (scene.albedo[ids] ** 2).sum(axis=1) * stands_for
     exact = direct.rows(ids.astype(np.uint32)).astype(np.uint32, copy=False)
     wrong, all_of_it = (float(power @ _energy(direct, ids, bits)) for bits in (exact ^ seen, exact))
-    return DirectCost(seconds, held.share(held.direct) * math.sqrt(wrong / max(all_of_it, 1e-300)))
+    return DirectCost(seconds, held.direct_share * math.sqrt(wrong / max(all_of_it, 1e-300)))
 
 
 def _patches(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mi_sparse_prt.estimation.darkness import DARK
 from mi_sparse_prt.estimation.element_sampling import Effort
 from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
@@ -56,7 +57,9 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     elif auto:
         light["edges"] = edges_cost(direct, held)
     check = _check(held)
-    costs = Costs(check, light, direct_share=held.share(held.direct))
+    # light by way of mirrors and glass is not among the elements
+    dark = not problem.specular_apart and held.light() <= DARK
+    costs = Costs(check, light, direct_share=held.direct_share, dark=dark)
     if settings.target_error is not None:
         costs = replace(costs, fixed=(1 + ROUND) * check, check=check)
     if not indirect:
@@ -69,7 +72,7 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     if auto and settings.basis == "direction" and asked in (None, fine):
         sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
         costs = replace(costs, sparse=sparse)
-    if asked is None and not (auto and _too_dear(costs, settings, path, noise_of_a_path(held))):
+    if asked is None and not dark and not (auto and _too_dear(costs, settings, path, noise_of_a_path(held))):
         every = [*coarse_resolutions(fine), fine]
         costs = replace(costs, paths=path_costs(problem, settings, held, path, every))
     return costs

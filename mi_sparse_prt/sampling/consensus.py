@@ -20,6 +20,7 @@ from mi_sparse_prt.sampling.features import copy_agreed, find_contested
 
 Ids = NDArray[np.int64]
 Trace = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.bool_]]
+LeaveFewer = Callable[[int, Ids, NDArray[np.int32]], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class ConsensusOptions:
         Known vertices that are asked. On a bumpy sphere, of whose vertices a quarter were known in a single level, 8
         left 11.6% of all elements to be traced, at an error of 4.9%; 12 left 12.6%, at 3.7%.
     least_neighbours : int
-        With fewer on its own surface, a vertex is sampled as those of the first level.
+        With fewer on its own surface, or none of them on its side of walls, a vertex is sampled as those of the first
+        level.
     repair_neighbours : int
         Of all vertices, asked again at the end.
     block : int
@@ -137,26 +139,32 @@ class Surface:
         return [order[level == number] for number in range(len(strides))]
 
 
-def sample_by_levels(state: Consensus, surface: Surface) -> None:
+def sample_by_levels(state: Consensus, surface: Surface, walls_leave_fewer: LeaveFewer) -> None:
     """Make the rows of a mesh known, level by level, and repair them.
 
     Parameters
     ----------
     state : Consensus
     surface : Surface
+    walls_leave_fewer : callable
+        ``walls_leave_fewer(least, vertices, neighbours)``: which vertices (n,) have fewer than so many of their
+        neighbours (n, k), -1 where there are none, on their own side of walls. Those behind a wall may see another
+        part of the scene, but where some are not, the others only add to what is traced.
     """
     options = state.options
     levels = surface.levels(options.strides)
+    p, n, first = surface.positions, surface.normals, surface.first
     known = levels[0]
-    state.sample(surface.first + known)
-    p, n = surface.positions, surface.normals
+    state.sample(first + known)
     for new in levels[1:]:
         near = surface_neighbours(p[new], n[new], p[known], n[known], options.neighbours).ids
+        near = renumber(near, first + known)
         lonely = (near >= 0).sum(axis=1) < options.least_neighbours
-        state.sample(surface.first + new[lonely])
-        state.agree(surface.first + new[~lonely], renumber(near[~lonely], surface.first + known))
+        lonely |= walls_leave_fewer(1, first + new, near)  # one is enough to object to those behind a wall
+        state.sample(first + new[lonely])
+        state.agree(first + new[~lonely], near[~lonely])
         known = np.concatenate([known, new])
     around = surface_neighbours(p[known], n[known], p, n, options.repair_neighbours + 1).ids[
         :, 1:
     ]  # without itself
-    state.repair(surface.first + known, renumber(around, surface.first + np.arange(len(p))))
+    state.repair(first + known, renumber(around, first + np.arange(len(p))))

@@ -48,7 +48,7 @@ class Plane:
 
     def state(self, **options: int) -> Consensus:
         state = Consensus(self.normals, GRID, self.trace, ConsensusOptions(**options))
-        sample_by_levels(state, self.surface())
+        sample_by_levels(state, self.surface(), lambda least, ids, near: np.zeros(len(ids), bool))
         return state
 
 
