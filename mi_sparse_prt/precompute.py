@@ -429,7 +429,7 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
 def _expectation(problem: Problem, expected: Forecast) -> str:
     return (
         f"{problem.scene.n_vertices} vertices x {problem.emission.n_directions} directions: "
-        f"about {expected.seconds:.0f} s and {expected.bytes / 1e6:.0f} MB"
+        f"about {expected.seconds:.0f} s and {expected.bytes / 1e6:.0f} MB of memory"
     )
 
 

@@ -10,37 +10,37 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.methods.execution import indirect_solver
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner.memory import peak_bytes
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 
 class _Share(NamedTuple):
-    """What a part costs, relative to brute force: seconds of direct rays and of paths, and bytes."""
+    """Seconds of direct rays and of paths that a part costs, relative to brute force."""
 
     rays: float
     paths: float
-    bytes: float
 
 
 # as measured at 6144 directions on scenes of 40,000 and 64,000 vertices: right within a factor of two there
 _DIRECT = {
-    "exact": _Share(1, 0, 1),
-    "consensus": _Share(0.35, 0, 1),
-    "edges": _Share(0.5, 0, 0.1),
-    "sparse": _Share(0.8, 0, 1),
-    "huang2010": _Share(2.7, 0, 0.22),
+    "exact": _Share(1, 0),
+    "consensus": _Share(0.35, 0),
+    "edges": _Share(0.5, 0),
+    "sparse": _Share(0.8, 0),
+    "huang2010": _Share(2.7, 0),
 }
 _INDIRECT = {
-    "none": _Share(0, 0, 0),
-    "paths": _Share(0, 1, 1),
-    "gather": _Share(0.55, 0, 0.05),
-    "sparse": _Share(0, 0.08, 0.06),
-    "huang2010": _Share(0, 0.12, 0.07),
+    "none": _Share(0, 0),
+    "paths": _Share(0, 1),
+    "gather": _Share(0.55, 0),
+    "sparse": _Share(0, 0.08),
+    "huang2010": _Share(0, 0.12),
 }
 
 
 class Forecast(NamedTuple):
-    """Seconds and bytes of a matrix."""
+    """Seconds that a matrix takes, and bytes beside those that the process has, at their peak."""
 
     seconds: float
     bytes: float
@@ -71,9 +71,7 @@ def forecast(
     """
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
     paths = indirect_solver(direct.problem, settings.of(plan))
-    elements = paths.lighting.n_directions * paths.channels
-    per_vertex = light.bytes * direct.row_storage(1).nbytes + more.bytes * 2 * elements
-    needed, available = len(direct.points) * per_vertex, psutil.virtual_memory().available
+    needed, available = peak_bytes(direct, paths, plan, indirect), psutil.virtual_memory().available
     if needed > available:
         raise PrtError(
             f"the matrix needs {needed / 1e9:.1f} GB but {available / 1e9:.1f} GB are free; "
