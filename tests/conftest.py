@@ -3,8 +3,10 @@
 Pure helpers are imported (``from conftest import diffuse``), what is expensive comes as session fixtures.
 """
 
+import gc
 import importlib
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,8 +35,8 @@ from mi_sparse_prt.solvers.problem import Problem, diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 matplotlib.use("Agg")
-if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores: threads of BLAS would wait for each other
-    threadpool_limits(1, user_api="blas")
+if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores
+    threadpool_limits(1, user_api="blas")  # whose threads would wait for each other
 T = mi.ScalarTransform4f
 ARTEFACTS = Path(__file__).parent / "artefacts"
 GREY = ((0.5,) * 3, (0.6,) * 3, (0.7,) * 3)  # ground, ball, box
@@ -259,6 +261,13 @@ def assert_same(a: LightTransport, b: LightTransport) -> None:
     for name, array in ours.items():
         assert (array.dtype, array.shape) == (theirs[name].dtype, theirs[name].shape), name
         assert array.tobytes() == theirs[name].tobytes(), name
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_garbage() -> Iterator[None]:
+    """Scenes that nobody has are given back: kernels have a branch for every kind of BSDF that is alive."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(scope="session")
