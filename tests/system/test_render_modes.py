@@ -67,6 +67,7 @@ def integrator(tmp_path_factory: pytest.TempPathFactory) -> dict:
     """Parameters of ours; all tests share a cache."""
     cache = str(tmp_path_factory.mktemp("modes"))
     return {"type": "sparse_prt", "resolution": 8, "max_depth": 4, "edge_length": 0.15} | {
+        "method": "gather",
         "progress": False,
         "cache": cache,
     }
