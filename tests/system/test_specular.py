@@ -286,7 +286,7 @@ def test_images_stop_light_where_paths_end():
         "light": {"type": "constant"},
     }
     whole = mi.load_dict({"type": "scene", **own})
-    scene, lighting = Scene.from_mitsuba(whole, 0.1), prt.CubemapLighting(2)
+    scene, lighting = Scene.from_mitsuba(whole, 0.1), prt.CubemapLighting(4)
     assert "half_back" in [mesh.name for mesh in scene.meshes]
     plan = Plan("edges", "gather", 256, 0.03)
     transport = prt.precompute(scene, lighting, plan, "texel", 4, progress=False)

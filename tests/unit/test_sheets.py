@@ -190,7 +190,7 @@ def test_light_is_gathered_from_the_sheet_that_rays_meet():
     exchange the colours.
     """
     roof = {**GROUND, "to_world": T().translate([0, 1.6, 0]).rotate([1, 0, 0], 90).scale(0.6)}
-    scene = build(0.1, leaf=leaf(twosided(RED, BLUE)), ground={**GROUND, "bsdf": twosided(RED)}, roof=roof)
+    scene = build(0.15, leaf=leaf(twosided(RED, BLUE)), ground={**GROUND, "bsdf": twosided(RED)}, roof=roof)
     lighting = prt.CubemapLighting(1)
     problem = problem_at(scene, lighting, basis="texel", max_depth=4)
     gather = RadiositySolver(problem, 1024)
