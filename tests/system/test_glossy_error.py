@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 LIGHTING = prt.CubemapLighting(4)
 TERMS, SEEDS = 2, range(48)
-EFFORT = Effort(spp=24)  # their noise is taken out, whatever it is
+EFFORT = Effort(spp=64)  # their noise is taken out, whatever it is
 Doubles = NDArray[np.float64]
 
 

@@ -52,7 +52,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "EDGE_LENGTH": 1e9,
         "TERMS": 2,
         "HARMONICS": 1,
-        "DIFFUSE_SCENE": "spot",
+        "DIFFUSE_SCENE": "cornell",
         "IMAGE_WIDTH": 96,
         "IMAGE_SPP": 2,
     },

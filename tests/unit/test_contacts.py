@@ -130,7 +130,7 @@ def test_errors_at_a_contact_shrink():
     scene, lighting = build(0.1, ground=GROUND, ball=BALL), LIGHTING
     points, near = vertex_points(scene), np.linalg.norm(scene.positions, axis=1)
     ids = np.setdiff1d(np.nonzero(near < 0.35)[0], contacts(scene, lighting).vertices)
-    paths = PathSolver(problem_at(scene, lighting, points, max_depth=3), 4096)
+    paths = PathSolver(problem_at(scene, lighting, points, max_depth=3), 1024)
     every = np.repeat(ids, lighting.n_directions), np.tile(np.arange(lighting.n_directions), len(ids))
     shape = len(ids), lighting.n_directions
     true = paths.elements(*every, 0).mean.reshape(shape) * lighting.solid_angles
