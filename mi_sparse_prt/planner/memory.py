@@ -82,7 +82,7 @@ def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     terms, rows, nodes = reflection.terms, reflection.row_count, min(n, NODES)
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
-    basis = ENTRY * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)  # and a copy in one piece
+    basis = 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)
     drawn = (
         3 * 4 * rows * FIRST_COMBINATIONS
     )  # columns of D that are added up, in pieces and in one, and times G
