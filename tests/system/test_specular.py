@@ -307,8 +307,8 @@ def test_images_stop_light_where_paths_end():
 def test_pixels_see_by_way_of_mirrors_and_glass():
     """Expected: at the points that a camera sees, light that is gathered is that of paths, and none is counted twice.
 
-    The mean over all pixels differs by less than 1% (0.2 to 0.8% over seeds and machines). Paths that count light again which passed
-    straight through surfaces find 6% more, and gathering without what arrives by mirrors and glass 11% less.
+    The mean over all pixels differs by less than 1% (0.2 to 0.8% over seeds and machines). Paths that count light
+    again that passed straight find 6% more, and gathering without what arrives by mirrors and glass 11% less.
     """
     scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
     camera = mi.load_dict(
