@@ -70,10 +70,8 @@ def _direct(direct: DirectSolver, plan: Plan) -> tuple[float, float]:
         return bits + parts, bits + parts
     if direct.basis == "texel":
         return 2.0 * n * texels, 0.0
-    return (
-        bits,
-        0.0 if plan.direct == "exact" else 2 * bits,
-    )  # what was evaluated, and what is above the horizon
+    # what was evaluated, and what is above the horizon
+    return bits, 0.0 if plan.direct == "exact" else 2 * bits
 
 
 def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
@@ -83,9 +81,8 @@ def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
     basis = 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)
-    drawn = (
-        3 * 4 * rows * FIRST_COMBINATIONS
-    )  # columns of D that are added up, in pieces and in one, and times G
+    # columns of D that are added up, in pieces and in one, and times G
+    drawn = 3 * 4 * rows * FIRST_COMBINATIONS
     if terms:
         colours = channels if channels == 1 else 3
         of_rays = found.hits * 4 * (6 + 1 + terms + colours * terms)
