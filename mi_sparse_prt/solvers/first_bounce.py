@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
@@ -157,8 +158,10 @@ def _basis(
     blocks: list[Floats] = []  # [row, combination]
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
+    draws, width = max(1, options.draws // len(albedo)), min(BITS, direct.shape[1])
+    mixed = np.empty((matrix.shape[1], draws * width), np.float32)
     while True:
-        block = _combinations(matrix, albedo, direct, options, rng)
+        block = _combinations(matrix, albedo, direct, mixed, options.mixed, rng)
         new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
@@ -192,13 +195,18 @@ def _combinations(
     matrix: scipy.sparse.csr_array,
     albedo: Floats,
     direct: Operator,
-    options: RandomBasis,
+    mixed: Floats,
+    few: int,
     rng: np.random.Generator,
 ) -> Floats:
-    """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations)."""
-    found, draws = [], max(1, options.draws // len(albedo))
+    """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations).
+
+    ``mixed`` (n_v, combinations of a channel) is overwritten.
+    """
+    found, width = [], min(BITS, direct.shape[1])
     for rho in albedo:
-        mixed = np.hstack([random_combinations(direct, options.mixed, rng) for _ in range(draws)])
+        for a in range(0, mixed.shape[1], width):
+            mixed[:, a : a + width] = random_combinations(direct, few, rng)
         found.append(multiply_scaled(matrix, rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)
 
