@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mi_sparse_prt.methods.plan import Plan
-from mi_sparse_prt.reconstruction.node_placement import NODES
+from mi_sparse_prt.reconstruction.node_placement import node_count
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
@@ -77,7 +77,7 @@ def _direct(direct: DirectSolver, plan: Plan) -> tuple[float, float]:
 def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     """Bytes of form factors and of the low rank that is made with them."""
     n, texels, reflection = len(direct.points), direct.lighting.n_directions, direct.problem.reflection
-    terms, rows, nodes = reflection.terms, reflection.row_count, min(n, NODES)
+    terms, rows, nodes = reflection.terms, reflection.row_count, node_count(direct.problem.scene)
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
     basis = 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
-from mi_sparse_prt.reconstruction.node_placement import NODES
+from mi_sparse_prt.reconstruction.node_placement import node_count
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
@@ -49,7 +49,7 @@ class GatherCosts:
 
     Attributes
     ----------
-    vertices, directions, channels : int
+    vertices, nodes, directions, channels : int
     ray : float
         Seconds of a gather ray, among those of its vertex.
     multiplication : float
@@ -71,6 +71,7 @@ class GatherCosts:
     """
 
     vertices: int
+    nodes: int
     directions: int
     channels: int
     ray: float
@@ -133,7 +134,7 @@ class GatherCosts:
 
     def seconds(self, rays: int, tolerance: float) -> float:
         """Predicted time of rays and interreflections: the terms are the steps of ``solvers.first_bounce``."""
-        nodes, rank, entries = min(self.vertices, NODES), self.rank(tolerance), rays * self.entries
+        nodes, rank, entries = self.nodes, self.rank(tolerance), rays * self.entries
         rows = max(USUAL.few_rows, USUAL.rows * rank)
         expanded = self.vertices * (self.directions + USUAL.mixed * rank)
         squares = SQUARES * nodes * rank**2 * self.channels
@@ -172,6 +173,7 @@ def gather_costs(
     ray = max(times[1] - times[0], 0.0) / ((TIMED - FEW) * len(held.vertices))
     return GatherCosts(
         scene.n_vertices,
+        node_count(scene),
         direct.lighting.n_directions,
         light[0][0].shape[2],
         ray,

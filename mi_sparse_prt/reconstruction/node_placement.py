@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.morton import morton_order
-from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.measurement.neighbours import Neighbours, surface_neighbours
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
-from mi_sparse_prt.scene.scene import Mesh, Scene
+from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.walls import Walls
 
 NODES = 1 << 16  # of a scene, if nothing else is asked for
+SMALL = 1 << 12  # vertices of a piece, of which none is left out; a larger piece has as many nodes at least
+
+Ids = NDArray[np.int64]
+
+
+class _Weights(NamedTuple):
+    """Entries of weights: vertices (m,), their nodes (m,), both among the scene's vertices, and numbers (m,)."""
+
+    vertices: Ids
+    nodes: Ids
+    values: NDArray[np.float32]
+
+
+def node_count(scene: Scene, most: int = NODES, small: int = SMALL) -> int:
+    """How many nodes ``choose_nodes`` chooses, about."""
+    if scene.n_vertices <= most:
+        return scene.n_vertices
+    return int(_wanted(np.bincount(scene.pieces), most, small).sum())
 
 
 def choose_nodes(
-    scene: Scene, points: Points, most: int = NODES, small: int = 4096, neighbours: int = 8
+    scene: Scene, points: Points, most: int = NODES, small: int = SMALL, neighbours: int = 8
 ) -> Nodes:
-    """About ``most`` vertices, evenly spread among those of each mesh; all of small meshes.
+    """About ``most`` vertices, evenly spread among those of each connected piece of a mesh; all of small pieces.
 
-    Which ones depends on where vertices are and on their keys, not on their order.
+    Light is interpolated within pieces: leaves of a tree are near each other and look elsewhere. Which ones are chosen
+    depends on where vertices are and on their keys, not on their order, nor on how pieces are shared out among meshes.
 
     Parameters
     ----------
@@ -31,9 +51,9 @@ def choose_nodes(
     points : Points
         Of all vertices.
     most : int
-        Nodes of the scene.
+        Nodes of the scene; more where small pieces have more vertices.
     small : int
-        Vertices of a mesh, of which none is left out; a larger mesh has as many nodes at least.
+        Vertices of a piece, of which none is left out; a larger piece has as many nodes at least.
     neighbours : int
         Nodes from which a vertex takes its light.
 
@@ -44,35 +64,37 @@ def choose_nodes(
     n = scene.n_vertices
     if n <= most:
         return Nodes(np.arange(n), None)
-    sizes = np.array([mesh.vertices.stop - mesh.vertices.start for mesh in scene.meshes])
+    sizes = np.bincount(scene.pieces)
+    wanted = _wanted(sizes, most, small)
+    every = np.flatnonzero((wanted == sizes)[scene.pieces])
+    found, walls = [_Weights(every, every, np.ones(len(every), np.float32))], Walls(scene, points)
+    for piece in np.flatnonzero(wanted < sizes):
+        members = np.flatnonzero(scene.pieces == piece)
+        found.append(_between_nodes(scene, points, walls, members, int(wanted[piece]), neighbours))
+    vertices, nodes, values = (np.concatenate(column) for column in zip(*found, strict=True))
+    ids, number = np.unique(nodes, return_inverse=True)
+    return Nodes(ids, scipy.sparse.csr_array((values, (vertices, number)), shape=(n, len(ids))))
+
+
+def _wanted(sizes: Ids, most: int, small: int) -> Ids:
+    """Nodes of pieces of so many vertices."""
     kept = sizes <= small
     share = max(most - sizes[kept].sum(), 0) / max(sizes[~kept].sum(), 1)
-    chosen, weights, walls = [], [], Walls(scene, points)
-    for mesh, size in zip(scene.meshes, sizes, strict=True):
-        wanted = min(size, max(small, round(share * size)))
-        ids, block = _nodes_of_mesh(scene, points, walls, mesh, wanted, neighbours)
-        chosen.append(ids)
-        weights.append(block)
-    return Nodes(np.concatenate(chosen), scipy.sparse.block_diag(weights, format="csr"))
+    return np.where(kept, sizes, np.clip(np.round(share * sizes), small, sizes)).astype(np.int64)
 
 
-def _nodes_of_mesh(
-    scene: Scene, points: Points, walls: Walls, mesh: Mesh, wanted: int, neighbours: int
-) -> tuple[NDArray[np.int64], scipy.sparse.csr_array]:
-    """Nodes of a mesh, and weights (vertices, nodes) of these."""
-    inside = mesh.vertices
-    p, n = scene.normalised_positions[inside], scene.normals[inside]
-    if wanted == len(p):
-        return np.arange(inside.start, inside.stop), scipy.sparse.eye_array(
-            wanted, dtype=np.float32, format="csr"
-        )
-    order = morton_order(p, points.keys[inside])
+def _between_nodes(
+    scene: Scene, points: Points, walls: Walls, members: Ids, wanted: int, neighbours: int
+) -> _Weights:
+    """Weights of nodes for the vertices of a piece."""
+    p, n = scene.normalised_positions[members], scene.normals[members]
+    order = morton_order(p, points.keys[members])
     # the middle one of each of so many stretches along the curve
     nodes = order[(2 * np.arange(wanted) + 1) * len(p) // (2 * wanted)]
 
-    def nearest(nodes: NDArray[np.int64]) -> Neighbours:
+    def nearest(nodes: Ids) -> Neighbours:
         near = surface_neighbours(p, n, p[nodes], n[nodes], neighbours)
-        return walls.without_hidden(np.arange(inside.start, inside.stop), near, inside.start + nodes)
+        return walls.without_hidden(members, near, members[nodes])
 
     near = nearest(nodes)
     alone = np.flatnonzero(near.ids[:, 0] < 0)  # no node faces the same way, on this side of walls
@@ -80,9 +102,5 @@ def _nodes_of_mesh(
         nodes = np.concatenate([nodes, alone])
         near = nearest(nodes)
     weights = linear_weights(near, p, n, p[nodes], n[nodes])
-    rank = np.argsort(np.argsort(nodes))  # of each node among all of the mesh
-    present = near.ids >= 0
-    starts = row_starts(present.sum(axis=1))
-    entries = weights[present], rank[near.ids[present]], starts
-    block = scipy.sparse.csr_array(entries, shape=(len(p), len(nodes)))
-    return inside.start + np.sort(nodes), block
+    vertex, place = np.nonzero(near.ids >= 0)
+    return _Weights(members[vertex], members[nodes[near.ids[vertex, place]]], weights[vertex, place])

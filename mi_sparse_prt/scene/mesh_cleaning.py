@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals, unique_rows
+from mi_sparse_prt.scene.triangle_mesh import (
+    TriangleMesh,
+    connected_pieces,
+    normalise_rows,
+    triangle_normals,
+    unique_rows,
+)
 
 
 def check_geometry(mesh: TriangleMesh) -> None:
@@ -164,8 +170,9 @@ def faces_inwards(mesh: TriangleMesh) -> bool:
     t = unique_rows(mesh.positions)[1][mesh.triangles]
     edges = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
     edge = unique_rows(edges)[1]
-    part = _connected_parts(t)  # [triangle]
-    is_open = np.zeros(part.max(initial=-1) + 1, bool)
+    pieces, label = connected_pieces(mesh.positions, mesh.triangles)
+    part = label[mesh.triangles[:, 0]]  # [triangle]
+    is_open = np.zeros(pieces, bool)
     is_open[np.repeat(part, 3)[np.bincount(edge)[edge] != 2]] = True
 
     p = mesh.positions.astype(np.float64)
@@ -176,15 +183,3 @@ def faces_inwards(mesh: TriangleMesh) -> bool:
         volume = np.where(np.sum(shading * triangle_normals(mesh), axis=1) < 0, -volume, volume)
     volumes = np.bincount(part, volume, minlength=len(is_open))
     return bool(np.any((volumes < 0) & ~is_open))
-
-
-def _connected_parts(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
-    """[triangle] number of the connected part that it belongs to."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
-    n = int(triangles.max(initial=-1)) + 1
-    _, label = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n)), directed=False)
-    _, part = np.unique(label[triangles[:, 0]], return_inverse=True)
-    return part.reshape(-1)

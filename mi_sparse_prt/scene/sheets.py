@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.shape_table import first_triangles
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, unique_rows
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces
 
 FEW_RAYS, MANY_RAYS = (
     64,
@@ -115,12 +115,8 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
         if not material.two_sided:
             result.append(np.full(n, PASSES_LIGHT if material.passes_light else NO_PIECE, np.int64))
             continue
-        first, same = unique_rows(mesh.positions)  # seams do not part a surface
-        corners = same[mesh.triangles]
-        edges = corners[:, [0, 1]].ravel(), corners[:, [1, 2]].ravel()
-        graph = scipy.sparse.coo_array((np.ones(2 * n, np.int8), edges), shape=(len(first), len(first)))
-        own, label = connected_components(graph, directed=False)
-        result.append(count + label[corners[:, 0]].astype(np.int64))
+        own, label = connected_pieces(mesh.positions, mesh.triangles)
+        result.append(count + label[mesh.triangles[:, 0]].astype(np.int64))
         count += own
     return np.concatenate(result)
 

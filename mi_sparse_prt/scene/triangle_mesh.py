@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 
@@ -103,6 +105,22 @@ def unique_rows(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         _, code = np.unique(code * (value.max(initial=0) + 1) + value, return_inverse=True)
     _, first = np.unique(code, return_index=True)
     return first, code
+
+
+def connected_pieces(
+    positions: NDArray[np.float32], triangles: NDArray[np.integer]
+) -> tuple[int, NDArray[np.int32]]:
+    """How many connected pieces triangles (t, 3) form, and which one each vertex (n,) belongs to.
+
+    Vertices at one position are one: seams do not part a surface. A vertex of no triangle is a piece as well.
+    """
+    first, same = unique_rows(positions)
+    corners = same[triangles]
+    edges = corners[:, [0, 1]].ravel(), corners[:, [1, 2]].ravel()
+    shape = len(first), len(first)
+    graph = scipy.sparse.coo_array((np.ones(2 * len(triangles), np.int8), edges), shape=shape)
+    count, label = connected_components(graph, directed=False)
+    return count, label[same]
 
 
 def triangle_keys(mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64) -> NDArray[np.uint64]:

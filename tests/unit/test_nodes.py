@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import COLOURS, build, problem_at, still_life
+from conftest import COLOURS, T, build, diffuse, mesh, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
@@ -27,10 +27,44 @@ def test_small_meshes_keep_all_vertices(scene):
     assert choose_nodes(scene, points, scene.n_vertices).weights is None
     nodes = choose_nodes(scene, points, 1000)
     assert 900 < len(nodes) < 1100
-    for mesh in scene.meshes:
-        size = mesh.vertices.stop - mesh.vertices.start
-        kept = np.sum((nodes.ids >= mesh.vertices.start) & (nodes.ids < mesh.vertices.stop))
+    for one in scene.meshes:
+        size = one.vertices.stop - one.vertices.start
+        kept = np.sum((nodes.ids >= one.vertices.start) & (nodes.ids < one.vertices.stop))
         assert kept == size if size <= 200 else 200 <= kept < size
+
+
+def test_pieces_of_a_mesh_are_as_meshes():
+    """
+    Rationale: a tree's leaves are one mesh or a thousand; near each other, they look elsewhere.
+    Setup: 40 turned cards over a ground, as one mesh and as 40.
+    Expected: the same nodes; each card vertex is one, and no weight of the ground's vertices is a card's.
+    """
+    rng = np.random.default_rng(5)
+    corner = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
+    corners = [
+        corner @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.uniform([-1, 0.3, -1], 1) for _ in range(40)
+    ]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    grey, ground = (
+        diffuse(0.5, 0.5, 0.5),
+        {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2)},
+    )
+    own = {f"card{k}": mesh(f"card{k}", p, faces, grey, False) for k, p in enumerate(corners)}
+    every = np.concatenate([faces + 4 * k for k in range(40)])
+    one = {"cards": mesh("cards", np.concatenate(corners), every, grey, False)}
+    found = []
+    for cards in (own, one):
+        scene = build(0.1, ground=ground | {"bsdf": grey}, **cards)
+        points = vertex_points(scene)
+        nodes = choose_nodes(scene, points, 400)
+        floor = scene.meshes[0].vertices
+        assert scene.n_vertices > 600
+        assert np.isin(np.arange(floor.stop, scene.n_vertices), nodes.ids).all()
+        of_cards = nodes.ids >= floor.stop
+        assert nodes.weights[: floor.stop][:, of_cards].nnz == 0
+        assert (nodes.weights[floor.stop :].sum(axis=1) == 1).all()
+        found.append(np.sort(points.keys[nodes.ids]))
+    assert np.array_equal(*found)
 
 
 def test_nodes_are_spread_evenly(scene):

@@ -208,7 +208,7 @@ def test_noise_of_rays_is_not_worth_a_rank():
     def costs(noise: float) -> GatherCosts:
         spectra = np.zeros((2, 4))
         return GatherCosts(
-            100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, {64: noise, 256: noise / 2}, 0.0, 0.1, 1.2, spectra
+            100, 100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, {64: noise, 256: noise / 2}, 0.0, 0.1, 1.2, spectra
         )
 
     assert costs(0.02).tolerances(64, 0.06) == (0.06, 0.2, 0.4)
@@ -229,7 +229,19 @@ def test_a_rank_grows_as_it_did_within_the_sample():
         spectra = (np.arange(256) < np.array([[half], [whole]])).astype(float)
         known = {"vertices": 50_000, "directions": 6144} | sizes
         return GatherCosts(
-            known["vertices"], known["directions"], 1, 0, 0, 0, 0.5, {64: 0.1, 256: 0.05}, 0, 0.1, 1, spectra
+            known["vertices"],
+            known["vertices"],
+            known["directions"],
+            1,
+            0,
+            0,
+            0,
+            0.5,
+            {64: 0.1, 256: 0.05},
+            0,
+            0.1,
+            1,
+            spectra,
         ).rank(0.03)
 
     assert rank(20, 20) == pytest.approx(20)
