@@ -141,16 +141,20 @@ def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[_Priced]:
 
 
 def choose(plans: list[Predicted], target: float | None) -> Predicted:
-    """Of the plans that meet a target, the one that is expected to take the least time, or the most exact if none does.
+    """Of the plans that meet a target, the one that is expected to take the least time.
 
-    A plan that may miss the target after all counts as if it took longer, by what would follow. Without a target, a
-    plan that misses 2% by some factor counts as if it took the square of that longer, as more samples would: nobody
-    asked for hours.
+    If none does, it is the quickest of those that are about as exact as the most exact one: where errors have a floor,
+    more rays buy next to nothing. A plan that may miss the target after all counts as if it took longer, by what would
+    follow. Without a target, a plan that misses 2% by some factor counts as if it took the square of that longer, as
+    more samples would: nobody asked for hours.
     """
     if target is None:
         return min(plans, key=lambda p: _if_it_met(TARGET, p))
     good = [p for p in plans if p.error <= target]
-    return min(good, key=lambda p: p.seconds + p.risk) if good else min(plans, key=lambda p: p.error)
+    if good:
+        return min(good, key=lambda p: p.seconds + p.risk)
+    least = min(p.error for p in plans)
+    return min((p for p in plans if MINIMUM_GAIN * p.error <= least), key=lambda p: p.seconds)
 
 
 def choose_first(plans: list[Predicted], target: float | None) -> Predicted:

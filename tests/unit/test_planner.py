@@ -111,10 +111,17 @@ def test_the_fewest_rays_that_meet_the_target():
     assert best(costs, 0.0232).plan == Plan("exact", "gather", *GATHER[1])
 
 
-def test_the_most_exact_plan_if_none_is_good_enough():
-    found = best(Costs(0, BOTH, PATHS, FakeGather()), 1e-4)
-    assert found == min(predictions(Costs(0, BOTH, PATHS, FakeGather()), 1e-4), key=lambda p: p.error)
-    assert found.plan.spp == 4096
+def test_the_quickest_of_the_most_exact_if_none_is_good_enough():
+    """
+    Rationale: where errors have a floor, 64 times the rays buy next to nothing.
+    Expected: none is 10% better, and no quicker one is within 10% of the best.
+    """
+    plans = predictions(Costs(0, BOTH, PATHS, FakeGather()), 1e-4)
+    found, least = best(Costs(0, BOTH, PATHS, FakeGather()), 1e-4), min(p.error for p in plans)
+    assert 0.9 * found.error <= least
+    assert all(0.9 * p.error > least for p in plans if p.seconds < found.seconds)
+    floor = best(Costs(0, BOTH, PATHS, BiasedGather(0.03)), 0.02, 1)
+    assert (floor.plan.indirect, floor.plan.rays) == ("gather", 1024)
 
 
 def test_without_a_target_nobody_waits_for_hours():
@@ -341,8 +348,9 @@ def test_short_of_what_takes_very_long_there_is_something_better():
 def test_no_plan_is_begun_that_takes_longer_than_asked():
     """
     Scenario: 1% by paths takes an hour, gathering ends at 20%.
-    Expected: of what fits into five minutes that with the least error, and the hour is spoken of; nothing is if it fits
-        or if it is asked for by name; nothing longer follows after a miss either.
+    Expected: of what fits into five minutes the quickest that is nearly as exact as can be, 64 rays, as all end at
+        20%; and the hour is spoken of; nothing is if it fits or if it is asked for by name; nothing longer follows
+        after a miss either.
     """
     paths = PathCosts({32: 1.0}, {32: 0.6}, {32: 0.0})
     costs = Costs(0, EXACT, paths, BiasedGather(0.2))
@@ -355,10 +363,7 @@ def test_no_plan_is_begun_that_takes_longer_than_asked():
     assert ranking(method="brute_force").plan == hour.plan
     short = ranking()
     assert short.seconds < 300 and short.too_long.plan == hour.plan
-    assert (
-        short.plan
-        == min((p for p in predictions(costs, 0.01) if p.seconds <= 300), key=lambda p: p.error).plan
-    )
+    assert (short.plan.indirect, short.plan.rays) == ("gather", 64)
     while short.after(missed(0.2), sum(p.seconds for p in short._tried)):
         assert short.seconds < 300
     assert all(p.seconds < 300 for p in short._tried)
