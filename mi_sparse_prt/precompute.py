@@ -187,7 +187,6 @@ class _Attempts:
         noise = 0.0 if specular is None else specular.error
         self._proposals = _proposals(direct, settings, self._dark is None, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
-        self._judged = self._problem if self._dark is None else replace(self._problem, max_depth=2)
 
     def matrix(self) -> LightTransport:
         """The matrix of the last attempt, with its report."""
@@ -203,7 +202,7 @@ class _Attempts:
         parts, plan = self._evaluated(first)
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
-            error = held_out_error(self._judged, transport, run.seed)
+            error = held_out_error(problem, transport, run.seed, indirect=self._dark is None)
         _warn_if_missed(error, self._settings, self._proposals.too_long)
         transport.report.update(
             _account(parts, problem, _skipped(problem.scene, self._dark, error))
@@ -226,9 +225,8 @@ class _Attempts:
             return []
         parts = self._execution.direct_light(how)
         with self._run.clock.phase("held_out"):
-            only = replace(problem, max_depth=2)
             stream = random_stream(self._run.seed, DECISION, 0)
-            found = held_out_error(only, matrix_of(problem, parts), stream)
+            found = held_out_error(problem, matrix_of(problem, parts), stream, indirect=False)
         proposals.choose_again(how, found.total)
         return [parts]
 
@@ -245,7 +243,7 @@ class _Attempts:
             with self._run.clock.phase("held_out"):
                 transport = matrix_of(self._problem, attempts[-1])
                 stream = random_stream(self._run.seed, DECISION, len(attempts))
-                found = held_out_error(self._judged, transport, stream, target)
+                found = held_out_error(self._problem, transport, stream, target, indirect=self._dark is None)
             errors.append(found.total)
             if found.total <= target or found.dark:
                 break

@@ -109,13 +109,13 @@ def held_out_error(
     seed: int | np.random.SeedSequence,
     target: float | None = None,
     effort: Effort = Effort(),  # noqa: B008  frozen
+    indirect: bool = True,
 ) -> HeldOutError:
     """Estimate the relative L2 error of a matrix.
 
     Parameters
     ----------
     problem : Problem
-        A matrix without indirect light is judged by what it lacks, unless ``max_depth`` is 2.
     transport : LightTransport
         Rows in the order of the scene's vertices.
     seed : int or SeedSequence
@@ -124,9 +124,13 @@ def held_out_error(
         Relative L2 error. If given, elements are drawn by the quarter until it is clear (2 standard errors) whether the
         error is above it.
     effort : Effort
+    indirect : bool
+        Whether a matrix without indirect light is judged by what it lacks. It is not if ``max_depth`` is 2; to ask for
+        that depth is something else, as light that goes straight through surfaces counts them.
     """
     stream = random_stream(seed, HELD_OUT)
-    estimator, rng = _Estimator(problem, transport, effort, stream), np.random.default_rng(stream)
+    estimator = _Estimator(problem, transport, effort, stream, indirect and problem.max_depth != 2)
+    rng = np.random.default_rng(stream)
     open_square = float(unoccluded_squares(problem.reflection.albedo, problem.emission).sum())
     if target is None:
         samples = estimator.samples(rng, 1.0)
@@ -196,9 +200,15 @@ class _Estimator:
     """Compares elements of a matrix with true ones."""
 
     def __init__(
-        self, problem: Problem, transport: LightTransport, effort: Effort, stream: np.random.SeedSequence
+        self,
+        problem: Problem,
+        transport: LightTransport,
+        effort: Effort,
+        stream: np.random.SeedSequence,
+        any_indirect: bool,
     ) -> None:
         self._problem, self._transport, self._effort = problem, transport, effort
+        self._any_indirect = any_indirect
         self._direct, self._indirect = transport.operators["direct"], transport.operators.get("indirect")
         self._seeds = element_seeds(stream, 4)
         self._rays = DirectSolver(problem, effort.strata, self._seeds[0])
@@ -213,7 +223,7 @@ class _Estimator:
         for mesh in self._transport.meshes:
             place = mesh.vertices, rng, self._effort, part
             chosen[mesh.name, "direct"] = for_direct_light(self._transport, normals, *place)
-            if self._problem.max_depth != 2:
+            if self._any_indirect:
                 chosen[mesh.name, "indirect"] = for_indirect_light(self._transport, *place)
         found: Samples = {}
         for keys in self._batches(chosen):

@@ -20,8 +20,8 @@ from mi_sparse_prt.planner.choice import (
     learned,
     predictions,
     uncertain,
+    with_direct,
 )
-from mi_sparse_prt.planner.direct_costs import DirectCost
 
 ATTEMPTS = 4
 TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
@@ -120,9 +120,8 @@ class CandidatePlans:
     def choose_again(self, direct: str, error: float) -> None:
         """Choose again, now that this direct light has been found and its error, relative to all of it, is known."""
         costs = self._costs
-        found = DirectCost(0.0, costs.direct_share * error)
         fixed = costs.fixed + costs.direct[direct].seconds
-        self._rank(replace(costs, fixed=fixed, direct=costs.direct | {direct: found}))
+        self._rank(replace(with_direct(costs, direct, costs.direct_share * error), fixed=fixed))
 
     def after(self, found: HeldOutError, elapsed: float) -> bool:
         """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.

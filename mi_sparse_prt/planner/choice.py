@@ -230,8 +230,19 @@ def learned(costs: Costs, plan: Plan, found: HeldOutError) -> Costs:
     if costs.gather is None or plan.indirect != "gather":
         return costs
     gather = costs.gather.learned(plan.rays, plan.tolerance, found.parts["indirect"])
-    direct = costs.direct | {plan.direct: DirectCost(0.0, found.parts["direct"])}
-    return replace(costs, gather=gather, direct=direct, specular=found.parts.get("specular", 0.0))
+    costs = with_direct(costs, plan.direct, found.parts["direct"])
+    return replace(costs, gather=gather, specular=found.parts.get("specular", 0.0))
+
+
+def with_direct(costs: Costs, name: str, error: float) -> Costs:
+    """Costs after one kind of direct light was found, with this error, relative to the whole matrix.
+
+    A pilot judges all kinds by the same elements: if these were harder than others, they were so for all.
+    """
+    expected = costs.direct[name].error
+    off = error / expected if expected > 0 else 1.0
+    others = {kind: replace(light, error=off * light.error) for kind, light in costs.direct.items()}
+    return replace(costs, direct=others | {name: DirectCost(0.0, error)})
 
 
 def better(plans: list[Predicted], error: float, seconds: float) -> Predicted | None:

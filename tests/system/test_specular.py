@@ -9,8 +9,11 @@ from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.estimation.held_out import held_out_error
 from mi_sparse_prt.measurement.pixels import camera_pixels
+from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -70,6 +73,22 @@ def test_furnace():
             few = mesh.vertices.stop - mesh.vertices.start < 200
             assert mean == pytest.approx(1, abs=0.04 if few else 0.01)
     assert specular[scene.meshes[0].vertices].mean() > 0.05
+
+
+def test_direct_light_through_holes_is_judged_at_its_own_depth():
+    """Rationale: a hole counts as a surface that light met; asked for a depth of 2, none would let any by.
+
+    Expected: visibility of a floor below a sheet with holes, judged alone, is right in all elements.
+    """
+    sheet = {"type": "mask", "opacity": CHECKERS, "bsdf": twosided(diffuse(0.5, 0.5, 0.5))}
+    above = T().translate([0, 0.5, 0]).rotate([1, 0, 0], -90).scale(2)
+    shapes = {"floor": FLOOR, "sheet": {"type": "rectangle", "to_world": above, "bsdf": sheet}}
+    scene, lighting = build(0.3, **shapes), prt.CubemapLighting(8)
+    direct = prt.precompute(scene, lighting, Plan("exact", "none"), max_depth=5, progress=False).direct
+    problem = replace(problem_at(scene, lighting, max_depth=5), specular_apart=True)
+    alone = matrix_of(problem, MethodResult(direct, None, 0, {}, {}))
+    assert held_out_error(problem, alone, 1, indirect=False).total < 1e-3
+    assert held_out_error(replace(problem, max_depth=2), alone, 1).total > 0.1
 
 
 def test_gathered_light_is_that_of_paths():

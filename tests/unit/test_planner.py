@@ -30,6 +30,7 @@ from mi_sparse_prt.planner.choice import (
     learned,
     predictions,
     uncertain,
+    with_direct,
 )
 from mi_sparse_prt.planner.direct_costs import PATCH, DirectCost, consensus_cost
 from mi_sparse_prt.planner.path_costs import PathCosts
@@ -565,12 +566,30 @@ def test_more_rays_that_did_not_help_are_not_tried_again():
         assert ranking.after(missed(errors[1]), 0.0) is goes_on
 
 
+def test_what_one_kind_of_direct_light_turns_out_to_be_tells_of_others():
+    """
+    Scenario: a pilot says 2% of "edges" and 3% of "exact"; the first is found to have 4%, "consensus" of a pilot none.
+    Expected: 6% of "exact", at the cost it had, and no more to pay for "edges"; of what seemed without error, none.
+    """
+    kinds = {
+        "edges": DirectCost(5.0, 0.02),
+        "exact": DirectCost(9.0, 0.03),
+        "consensus": DirectCost(2.0, 0.0),
+    }
+    after = with_direct(Costs(0, kinds), "edges", 0.04).direct
+    assert after["edges"] == DirectCost(0.0, 0.04)
+    assert after["exact"].seconds == 9.0 and after["exact"].error == pytest.approx(0.06)
+    assert after["consensus"] == kinds["consensus"]
+    after = with_direct(Costs(0, kinds), "consensus", 0.01).direct
+    assert after["exact"] == kinds["exact"]
+
+
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
     """Expected: if the second of two plans turns out worse, the matrix and its report are those of the first."""
     lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3, 0.25, 0.25))
 
-    def judged(problem, transport, stream, target=None):
-        found = held_out_error(problem, transport, stream, target)
+    def judged(problem, transport, stream, target=None, **given):
+        found = held_out_error(problem, transport, stream, target, **given)
         return found if target is None else replace(found, total=next(errors))
 
     module = importlib.import_module("mi_sparse_prt.precompute")
