@@ -28,7 +28,7 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
-from mi_sparse_prt.planner.choice import WORST_FACTOR, Predicted
+from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted, noise_that_does_not_matter
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
@@ -178,14 +178,18 @@ class _Attempts:
     def __init__(self, direct: DirectSolver, settings: Settings, run: Run) -> None:
         self._direct, self._problem, self._settings, self._run = direct, direct.problem, settings, run
         self._dark = _no_indirect(direct.problem, settings, run.clock)
+        settings, costs = _measured(direct, settings, self._dark is None, run.clock)
         specular = None
         if self._dark is None and self._problem.specular_apart:
+            options = settings.specular
+            if costs is not None:
+                noise = noise_that_does_not_matter(costs, settings.target_error, settings.max_seconds)
+                options = replace(options, error=max(options.error, noise))
             with run.clock.phase("specular"):
-                specular = specular_light(self._problem, run.seed, settings.specular)
+                specular = specular_light(self._problem, run.seed, options)
                 if self._problem.reflection.terms:
                     specular = with_term_rows(self._problem, specular, run.seed)
-        noise = 0.0 if specular is None else specular.error
-        self._proposals = _proposals(direct, settings, self._dark is None, noise, run.clock)
+        self._proposals = _proposals(settings, costs, 0.0 if specular is None else specular.error, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
 
     def matrix(self) -> LightTransport:
@@ -364,16 +368,24 @@ def _skipped(scene: Scene, reason: str | None, error: HeldOutError) -> list[str]
     return left_out
 
 
-def _proposals(
-    direct: DirectSolver, settings: Settings, indirect: bool, specular: float, clock: Stopwatch
-) -> RefinementSchedule | CandidatePlans:
-    """The plans to try, measured and ranked where the method leaves them open; ``specular`` is an error of all."""
+def _measured(
+    direct: DirectSolver, settings: Settings, indirect: bool, clock: Stopwatch
+) -> tuple[Settings, Costs | None]:
+    """What plans cost, where the method leaves these open, and the settings that then hold."""
     if settings.method == "brute_force" and settings.target_error is not None and indirect:
         settings = replace(settings, spp=None, indirect_resolution=None)
     elif settings.method != "auto" or settings.view_dependent or settings.measurement != "vertices":
-        return refinement_schedule(settings)
+        return settings, None
     with clock.phase("plan"):
-        costs = measure(direct, settings, indirect)
+        return settings, measure(direct, settings, indirect)
+
+
+def _proposals(
+    settings: Settings, costs: Costs | None, specular: float, clock: Stopwatch
+) -> RefinementSchedule | CandidatePlans:
+    """The plans to try, ranked by what was measured, if anything was; ``specular`` is an error of all."""
+    if costs is None:
+        return refinement_schedule(settings)
     costs = replace(costs, fixed=costs.fixed + clock.report()["total"], specular=specular)
     return CandidatePlans(costs, settings)
 

@@ -107,9 +107,9 @@ class Counter:
         pipeline = importlib.import_module("mi_sparse_prt.precompute")
         held_out_error = pipeline.held_out_error
 
-        def uncounted(*arguments: Any) -> HeldOutError:
+        def uncounted(*arguments: Any, **given: Any) -> HeldOutError:
             paths = self.paths
-            found = held_out_error(*arguments)
+            found = held_out_error(*arguments, **given)
             self.paths = paths
             return found
 

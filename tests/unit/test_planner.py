@@ -28,6 +28,7 @@ from mi_sparse_prt.planner.choice import (
     choose_first,
     finer,
     learned,
+    noise_that_does_not_matter,
     predictions,
     uncertain,
     with_direct,
@@ -582,6 +583,17 @@ def test_what_one_kind_of_direct_light_turns_out_to_be_tells_of_others():
     assert after["consensus"] == kinds["consensus"]
     after = with_direct(Costs(0, kinds), "consensus", 0.01).direct
     assert after["exact"] == kinds["exact"]
+
+
+def test_specular_light_is_as_exact_as_what_is_beside_it():
+    """
+    Scenario: gathering ends at 30 or at 9%, for a target of 5%; paths would meet it in days.
+    Expected: beside 30%, noise of 14.5%, as the root of 1 / 0.81 - 1 has it; beside 9%, which may be half of it,
+        and where as many hours are allowed as paths take, none but what the target allows.
+    """
+    for bias, hours, noise in ((0.3, 0.05, 0.145), (0.09, 0.05, 0.0), (0.3, 1e3, 0.0)):
+        costs = Costs(0, EXACT, PathCosts({32: 1e3}, {32: 0.6}, {32: 0.0}), BiasedGather(bias))
+        assert noise_that_does_not_matter(costs, 0.05, 3600 * hours) == pytest.approx(noise, rel=0.02)
 
 
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
