@@ -167,11 +167,12 @@ def faces_inwards(mesh: TriangleMesh) -> bool:
     Vertices are welded by position first. A part is closed if each of its edges belongs to two triangles.
     Which way a triangle faces is what its shading normals say, since that is what a one-sided BSDF looks at.
     """
-    t = unique_rows(mesh.positions)[1][mesh.triangles]
+    first, same = unique_rows(mesh.positions)
+    t = same[mesh.triangles]
     edges = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
     edge = unique_rows(edges)[1]
-    pieces, label = connected_pieces(mesh.positions, mesh.triangles)
-    part = label[mesh.triangles[:, 0]]  # [triangle]
+    pieces, label = connected_pieces(t, len(first))
+    part = label[t[:, 0]]  # [triangle]
     is_open = np.zeros(pieces, bool)
     is_open[np.repeat(part, 3)[np.bincount(edge)[edge] != 2]] = True
 

@@ -25,7 +25,7 @@ from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.traversal import places_of_lamps
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, triangle_keys
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, triangle_keys, unique_rows
 
 FEW_MESHES = 12  # more are sampled together: what each took would grow with shapes, not with vertices
 
@@ -240,8 +240,9 @@ class Scene:
         """(n_v,) number of the connected piece of each vertex; both sides of a surface are pieces of their own."""
         label, count = np.empty(self.n_vertices, np.int64), 0
         for mesh in self.meshes:
-            own, of_mesh = connected_pieces(self.positions[mesh.vertices], mesh.triangles)
-            label[mesh.vertices] = count + of_mesh
+            first, same = unique_rows(self.positions[mesh.vertices])
+            own, of_place = connected_pieces(same[mesh.triangles], len(first))
+            label[mesh.vertices] = count + of_place[same]
             count += own
         return label
 

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.shape_table import first_triangles
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
 
 FEW_RAYS, MANY_RAYS = (
     64,
@@ -115,8 +115,10 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
         if not material.two_sided:
             result.append(np.full(n, PASSES_LIGHT if material.passes_light else NO_PIECE, np.int64))
             continue
-        own, label = connected_pieces(mesh.positions, mesh.triangles)
-        result.append(count + label[mesh.triangles[:, 0]].astype(np.int64))
+        first, same = unique_rows(mesh.positions)
+        corners = same[mesh.triangles]
+        own, label = connected_pieces(corners, len(first))
+        result.append(count + label[corners[:, 0]].astype(np.int64))
         count += own
     return np.concatenate(result)
 

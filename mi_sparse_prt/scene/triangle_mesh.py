@@ -107,20 +107,15 @@ def unique_rows(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return first, code
 
 
-def connected_pieces(
-    positions: NDArray[np.float32], triangles: NDArray[np.integer]
-) -> tuple[int, NDArray[np.int32]]:
-    """How many connected pieces triangles (t, 3) form, and which one each vertex (n,) belongs to.
+def connected_pieces(triangles: NDArray[np.integer], n: int) -> tuple[int, NDArray[np.int32]]:
+    """How many connected pieces triangles (t, 3) form, and which one each of n vertices belongs to, (n,).
 
-    Vertices at one position are one: seams do not part a surface. A vertex of no triangle is a piece as well.
+    Vertices are welded by position first (``unique_rows``): seams do not part a surface. A vertex of no triangle is a
+    piece as well.
     """
-    first, same = unique_rows(positions)
-    corners = same[triangles]
-    edges = corners[:, [0, 1]].ravel(), corners[:, [1, 2]].ravel()
-    shape = len(first), len(first)
-    graph = scipy.sparse.coo_array((np.ones(2 * len(triangles), np.int8), edges), shape=shape)
-    count, label = connected_components(graph, directed=False)
-    return count, label[same]
+    edges = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
+    graph = scipy.sparse.coo_array((np.ones(2 * len(triangles), np.int8), edges), shape=(n, n))
+    return connected_components(graph, directed=False)
 
 
 def triangle_keys(mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64) -> NDArray[np.uint64]:

@@ -45,16 +45,14 @@ def test_pieces_of_a_mesh_are_as_meshes():
         corner @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.uniform([-1, 0.3, -1], 1) for _ in range(40)
     ]
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    grey, ground = (
-        diffuse(0.5, 0.5, 0.5),
-        {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2)},
-    )
+    grey = diffuse(0.5, 0.5, 0.5)
+    ground = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": grey}
     own = {f"card{k}": mesh(f"card{k}", p, faces, grey, False) for k, p in enumerate(corners)}
     every = np.concatenate([faces + 4 * k for k in range(40)])
     one = {"cards": mesh("cards", np.concatenate(corners), every, grey, False)}
     found = []
     for cards in (own, one):
-        scene = build(0.1, ground=ground | {"bsdf": grey}, **cards)
+        scene = build(0.1, ground=ground, **cards)
         points = vertex_points(scene)
         nodes = choose_nodes(scene, points, 400)
         floor = scene.meshes[0].vertices
