@@ -135,6 +135,9 @@ def running(json_file: str | None, quiet: bool, outputs: Iterable[Path | None] =
     except KeyboardInterrupt as interrupt:
         traceback.clear_frames(interrupt.__traceback__)  # ends progress bars, so that the message comes last
         _complain(command.interrupted())
+        # Where Ctrl-C met source code that a library (numba, dataclasses) ran with `exec`, CPython 3.11's `-m` keeps in
+        # mind to end by the signal, whatever the exit code; the next such source makes it forget.
+        exec("")
         raise typer.Exit(INTERRUPTED) from None
     except PrtError as error:
         _complain(str(error))

@@ -88,6 +88,30 @@ def test_ctrl_c_leaves_nothing(tmp_path, phase):
     assert waited < 2.0
 
 
+def test_ctrl_c_in_source_that_a_library_runs(tmp_path):
+    """
+    Rationale: numba and dataclasses run source code with `exec`. Where Ctrl-C met it, CPython ended by the signal (-2),
+        not with the exit code, whoever had caught the exception.
+    Expected: the exit code of any other interruption.
+    """
+    program = """
+from mi_sparse_prt.cli import app
+from mi_sparse_prt.cli.running import running
+
+@app.command()
+def work():
+    with running(None, quiet=True):
+        exec("raise KeyboardInterrupt")
+
+app(["work"])
+"""
+    (tmp_path / "work.py").write_text(program)
+    command = [sys.executable, "-m", "work"]  # as `python -m mi_sparse_prt`
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "mi-sparse-prt: interrupted; nothing was written\n"
+
+
 def test_ctrl_c_in_a_callback(monkeypatch):
     """One that cannot raise shows nothing; other trouble there does, and so does Ctrl-C once no command runs."""
     shown: list[type] = []
