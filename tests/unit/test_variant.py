@@ -25,6 +25,7 @@ def machine(monkeypatch):
         )
         drjit = SimpleNamespace(
             JitBackend=SimpleNamespace(CUDA="cuda", LLVM="llvm"),
+            thread_count=lambda: 2,
             has_backend=lambda backend: cuda if backend == "cuda" else llvm is not None,
             detail=SimpleNamespace(llvm_version=lambda: llvm),
         )
@@ -120,6 +121,23 @@ def test_the_chosen_llvm_compiles_the_kernel_that_aborts_old_ones():
         MI_SPARSE_PRT_VARIANT="llvm_ad_rgb",
     )
     assert done.stdout.split() == ["llvm_ad_rgb", "3.0"], done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot give a process one core")
+def test_environments_are_read_on_one_core(tmp_path):
+    """
+    Rationale: Mitsuba's OpenEXR waits for threads of Dr.Jit's pool, of which one core has none: it never returned.
+    Expected: a picture is written and read within two minutes, which are the limit of the process.
+    """
+    done = run_python(
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import numpy as np, mitsuba as mi, mi_sparse_prt as prt\n"
+        f"path = {str(tmp_path / 'sky.exr')!r}\n"
+        "mi.Bitmap(np.ones((64, 128, 3), np.float32)).write(path)\n"
+        "print(prt.CubemapLighting(1).project(prt.load_environment(path)).shape)",
+        MI_SPARSE_PRT_VARIANT="llvm_ad_rgb",
+    )
+    assert done.stdout == "(6, 3)\n", done.stderr
 
 
 def test_an_llvm_that_aborts_is_refused_before_it_can():
