@@ -23,6 +23,7 @@ import matplotlib
 import mitsuba as mi
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.estimation.element_sampling import Effort
@@ -46,6 +47,8 @@ if PINNED:
     # one: both pinning and this take a fifth off the time of kernels.
     for thread in set(os.listdir("/proc/self/task")) - THREADS:
         os.setpriority(os.PRIO_PROCESS, int(thread), 19)
+if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores
+    threadpool_limits(1, user_api="blas")  # whose threads would wait for each other
 matplotlib.use("Agg")
 T = mi.ScalarTransform4f
 ARTEFACTS = Path(__file__).parent / "artefacts"
