@@ -75,7 +75,9 @@ def choose_variant(name: str | None = None) -> str:
         raise PrtError("variant cuda_ad_rgb: no CUDA driver or GPU found: use llvm_ad_rgb")
     if mi.variant() != name:
         mi.set_variant(name)
-    if dr.thread_count() < 2:  # one core: Mitsuba would wait for ever for threads that read and write EXR files
+    if (
+        dr.thread_count() < 2
+    ):  # one core: Mitsuba would wait for ever for threads that read and write EXR files
         dr.set_thread_count(2)
     return name
 
