@@ -75,9 +75,8 @@ def choose_variant(name: str | None = None) -> str:
         raise PrtError("variant cuda_ad_rgb: no CUDA driver or GPU found: use llvm_ad_rgb")
     if mi.variant() != name:
         mi.set_variant(name)
-    if (
-        dr.thread_count() < 2
-    ):  # one core: Mitsuba would wait for ever for threads that read and write EXR files
+    # on one core Mitsuba waits for ever for a thread that reads and writes EXR files
+    if dr.thread_count() < 2:
         dr.set_thread_count(2)
     return name
 
