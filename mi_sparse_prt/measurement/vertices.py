@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import hash_rows
+from mi_sparse_prt.measurement.touching_vertices import move_off
 from mi_sparse_prt.scene.scene import Scene
 
 
@@ -62,6 +63,7 @@ def _vertex_points(scene: Scene) -> Points:
     offset = 4 * float(mi.math.RayEpsilon) * (1 + np.abs(positions[border]).max(axis=1, keepdims=True))
     moved = positions.copy()
     moved[border] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
+    moved = move_off(scene, moved, border)
     # two vertices may differ only in the side to which they moved: where two meshes meet
     return Points(moved, scene.normals, scene.normals, hash_rows(moved, scene.vertex_keys))
 

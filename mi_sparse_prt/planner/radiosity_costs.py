@@ -19,7 +19,6 @@ from mi_sparse_prt.reconstruction.node_placement import node_count
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.touching_surfaces import contacts
 
 GATHERED = 4  # spawn key
 FEW, MANY = 64, 256  # rays per vertex of a pilot
@@ -229,7 +228,6 @@ class _Pilot:
         scene = direct.problem.scene
         self._scene, self._direct, self._vertices = scene, direct, vertices
         self._albedo = scene.albedo[:, : 1 if scene.grey else 3]
-        self._contacts = contacts(scene, direct.lighting)
 
     def rays(self, count: int, seed: int) -> scipy.sparse.csr_array:
         """Rows of G."""
@@ -240,8 +238,7 @@ class _Pilot:
         row = np.repeat(np.arange(len(texels)), np.diff(rays.indptr))
         asked = texels[row]  # [entry, texel]
         vertices = np.repeat(rays.indices, asked.shape[1])
-        seen = self._direct.elements(vertices, asked.ravel()) * self._contacts.counts(vertices, asked.ravel())
-        seen = seen.reshape(asked.shape)
+        seen = self._direct.elements(vertices, asked.ravel()).reshape(asked.shape)
         mean = scipy.sparse.csr_array(
             (rays.data, np.arange(len(row)), rays.indptr), shape=(len(texels), len(row))
         )

@@ -22,6 +22,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.emission.space import SampledEmission
+from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.varying_diffuse import VaryingDiffuse
@@ -85,6 +86,7 @@ class RelitScene:
         self._backs = mi.Int32(scene.backs.astype(np.int32))
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
+        self._hidden, self._centre, self._scale = hidden_corners(scene), mi.Point3f(scene.centre), scene.scale
 
     def radiance(
         self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask, hide_background: bool = False
@@ -127,7 +129,7 @@ class RelitScene:
         whole = is_one_of(self.followed, si)
         valid = reflects & si.is_valid() & ~whole
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
-        corners, lit = self._hit_corners(hit, valid, behind)
+        corners, lit = self._hit_corners(hit, si, ray, valid, behind)
         light = (self._deepest - dr.minimum(depth, self._deepest)) * self._n_vertices
         value = dr.select(lit, self._shaded(si, corners, light, u, lit), 0)
         if self._lamps is not None:
@@ -137,9 +139,14 @@ class RelitScene:
         return Seen(value, si, whole)
 
     def _hit_corners(
-        self, hit: mi.PreliminaryIntersection3f, valid: mi.Mask, behind: mi.Mask
+        self,
+        hit: mi.PreliminaryIntersection3f,
+        si: mi.SurfaceInteraction3f,
+        ray: mi.Ray3f,
+        valid: mi.Mask,
+        behind: mi.Mask,
     ) -> tuple[list[Corner], mi.Mask]:
-        """The vertices around each hit, on the sheet that it is on, and whether that has any."""
+        """The vertices around each hit, on the sheet that it is on and on its side of walls; whether it has any."""
         triangle = self._first_triangle.gather(hit.shape, valid) + hit.prim_index
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
@@ -148,7 +155,12 @@ class RelitScene:
         vertices = [
             dr.select(behind, mi.UInt32(back), vertex) for back, vertex in zip(backs, vertices, strict=True)
         ]
-        return list(zip(vertices, (1 - u - v, u, v), strict=True)), valid
+        weights = [1 - u - v, u, v]
+        if self._hidden.some:
+            place = (si.p - self._centre) * self._scale
+            lit = dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d))
+            weights = self._hidden.weights(triangle, place, lit, weights, valid)
+        return list(zip(vertices, weights, strict=True)), valid
 
     def _shaded(
         self,

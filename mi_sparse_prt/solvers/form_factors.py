@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.core.sobol import sobol_points
+from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
@@ -78,6 +79,7 @@ class Surfaces:
         self._first_triangle = first_triangles(self._scene)
         self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
         self._normals = mi.Vector3f(scene.normals.T)
+        self._hidden = hidden_corners(scene)
         self._backs = mi.UInt32(np.where(scene.backs < 0, NOTHING, scene.backs).astype(np.uint32))
         dr.eval(self._triangles, self._normals, self._backs)
 
@@ -104,16 +106,21 @@ class Surfaces:
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
         first = self._first_triangle.gather(hit.shape, valid)
-        corners = [
-            dr.gather(mi.UInt32, self._triangles, 3 * (first + hit.prim_index) + k, valid) for k in range(3)
-        ]
+        triangle = first + hit.prim_index
+        corners = [dr.gather(mi.UInt32, self._triangles, 3 * triangle + k, valid) for k in range(3)]
         b = hit.prim_uv.x, hit.prim_uv.y
         weights = 1 - b[0] - b[1], *b
         normal = mi.Vector3f(0)
         for corner, weight in zip(corners, weights, strict=True):
             normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
-        chosen = dr.select(u < b[0], corners[1], dr.select(u < b[0] + b[1], corners[2], corners[0]))
         front = dr.dot(normal, ray.d) < 0  # of the shading normal, as for Mitsuba's BSDFs
+        if self._hidden.some:
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, valid)
+            lit = dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d))
+            k = self._hidden.choose(triangle, si.p, lit, weights, u, valid)
+        else:
+            k = dr.select(u < b[0], 1, dr.select(u < b[0] + b[1], mi.UInt32(2), 0))
+        chosen = dr.select(k == 1, corners[1], dr.select(k == 2, corners[2], corners[0]))
         chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._backs, chosen, valid & ~front))
         return dr.select(valid, chosen, NOTHING)
 

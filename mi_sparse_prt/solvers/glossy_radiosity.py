@@ -43,7 +43,6 @@ from mi_sparse_prt.solvers.radiosity import (
 )
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
-from mi_sparse_prt.solvers.touching_surfaces import contacts
 
 MOST_BOUNCES = 64  # where there is no limit
 NOISE_VERTICES = 4096  # at which noise is looked at
@@ -85,7 +84,6 @@ class GlossyGather(FiniteElements):
             albedo[None],
             np.concatenate(keys),
             Nodes(np.arange(direct.shape[0]), None),
-            contacts(problem.scene, problem.emission),
             problem.max_depth,
             seed,
         )

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
-from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
@@ -41,7 +40,6 @@ from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.stacked import Stacked
 from mi_sparse_prt.solvers.surface_nodes import Nodes
-from mi_sparse_prt.solvers.touching_surfaces import Contacts, contacts
 
 COLUMNS = 256  # of a dense matrix that G is applied to at a time
 NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
@@ -120,8 +118,6 @@ class FiniteElements:
         Random numbers are made of them.
     nodes : Nodes
         Those that gather light, others interpolate theirs.
-    contacts : Contacts
-        Vertices whose light is in part none for the triangles around them.
     max_depth : int
         As Mitsuba's ``path`` counts it: 3 = one interreflection, -1 = no limit. Bounces that add next to
         nothing are left out.
@@ -140,7 +136,6 @@ class FiniteElements:
         albedo: Floats,
         keys: NDArray[np.uint64],
         nodes: Nodes,
-        contacts: Contacts | None,
         max_depth: int,
         seed: int,
     ) -> None:
@@ -148,7 +143,7 @@ class FiniteElements:
             matrices[0] if len(matrices) == 1 else scipy.sparse.csr_array(sum(matrices[1:], matrices[0]))
         )
         self._matrices, self._albedo, self._keys, self.nodes = matrices, albedo, keys, nodes
-        self.contacts, self.max_depth, self.seed = contacts, max_depth, seed
+        self.max_depth, self.seed = max_depth, seed
         self.channels, self.options = len(albedo), LowRankOptions()
 
     def apply(self, columns: Floats) -> Floats:
@@ -157,7 +152,7 @@ class FiniteElements:
         Parameters
         ----------
         columns : (n_v, k) float32
-            Unit-albedo direct transport of each light, without what ``contacts`` leaves out.
+            Unit-albedo direct transport of each light.
 
         Returns
         -------
@@ -204,7 +199,6 @@ class FiniteElements:
         (k, n_directions, channels) float32
             Unit-albedo indirect transport.
         """
-        direct = self._lit(direct)
         count = self._count_for(direct)
         totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
         result = np.empty((len(ids), direct.shape[1], self.channels), np.float32)
@@ -248,7 +242,6 @@ class FiniteElements:
         Gathered or GatheredByDepth
             The latter if ``specular`` is told apart by depth.
         """
-        direct = self._lit(direct)
         if specular is not None and specular.by_depth:
             return self._by_depth((direct, *specular.by_depth[:-1]), tolerance)
         if specular is not None:
@@ -349,10 +342,6 @@ class FiniteElements:
                 total[:, i] += x
         return totals
 
-    def _lit(self, direct: Operator) -> Operator:
-        """Direct light without what vertices in touch with other surfaces see behind these."""
-        return direct if self.contacts is None else self.contacts.lit(direct)
-
     def _count_for(self, direct: Operator) -> int:
         return self.bounces(direct.relight(np.ones((direct.shape[1], 3), np.float32))[:, 0])
 
@@ -424,8 +413,6 @@ class RadiositySolver(FiniteElements):
     Attributes
     ----------
     nodes : Nodes
-    contacts : Contacts
-        Vertices whose light is in part none for the triangles around them.
     matrix : (n_nodes, n_v) sparse float32
         G. Rows sum to the share of the hemisphere, by cosine, in which sheets of surfaces are seen that have vertices.
     channels : {1, 3}
@@ -447,14 +434,13 @@ class RadiositySolver(FiniteElements):
         nodes: Nodes | None = None,
         options: LowRankOptions | None = None,
     ) -> None:
-        scene, points, emission = problem.scene, problem.points, problem.emission
+        scene, points = problem.scene, problem.points
         nodes = nodes or Nodes(np.arange(len(points)), None)
         super().__init__(
             form_factors(problem, rays_per_vertex, seed, nodes.ids),
             np.ascontiguousarray(scene.albedo.T[: problem.channels]),
             points.keys,
             nodes,
-            contacts(scene, emission) if isinstance(emission, CubemapLighting) else None,
             problem.max_depth,
             seed,
         )
@@ -480,8 +466,7 @@ class RadiositySolver(FiniteElements):
         found = form_factors(problem, self._rays_per_vertex, self.seed, every)
         matrix = scipy.sparse.csr_array(sum(found[1:], found[0]))
         self.rays += len(points) * self._rays_per_vertex
-        lit = self._lit(direct)
-        lit = lit if specular is None else Sum((lit, specular))
+        lit = direct if specular is None else Sum((direct, specular))
         first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
         specular = Sum(specular.by_depth) if specular is not None and specular.by_depth else specular
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before

@@ -153,6 +153,8 @@ def test_a_black_scene_needs_no_indirect_ray(rays, method):
     direct light alone.
     """
     black = build(0.5, **still_life(((0, 0, 0),) * 3))
+    vertex_points(black)  # which asks what vertices touch
+    rays.clear()
     transport = precompute(black, method=method)
     assert rays.full == 0
     assert transport.indirect is None

@@ -268,9 +268,7 @@ def test_inner_product_of_finite_elements(coloured_scene, most_nodes):
     off_in_another_order = []
     for _ in range(3):
         m, light = rng.normal(size=coloured_scene.n_vertices), rng.random((96, 3), dtype=np.float32) ** 4
-        bounced = gather.apply(
-            gather.contacts.lit(direct).relight(light)
-        )  # [vertex, light of a channel, channel]
+        bounced = gather.apply(direct.relight(light))  # [vertex, light of a channel, channel]
         forward = np.einsum("i,icc->", m, bounced, dtype=np.float64)
         solution = np.einsum("i,ijc->jc", m, rows)
         adjoint, wrong = (np.vdot(solution, some) for some in (light, light[::-1]))

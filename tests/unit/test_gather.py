@@ -262,7 +262,7 @@ def test_low_rank_and_rows_against_the_series(coloured_scene, kind, monkeypatch)
     monkeypatch.setattr(ColumnBlocks.__init__, "__defaults__", (250 * 30,))
     direct = direct_parts(coloured_scene)[kind]
     gather = solver(coloured_scene, 4)
-    white = gather.contacts.lit(direct).columns(np.arange(96))[..., 0]
+    white = direct.columns(np.arange(96))[..., 0]
     known = neumann(gather, white, coloured_scene.albedo, 3)
     some = np.array([7, 200, 7, 250])
     assert relative(gather.rows(direct, some), known[some]) < 1e-5
@@ -305,7 +305,7 @@ def test_a_basis_from_some_of_the_directions(coloured_scene):
     gather = solver(coloured_scene, 8, max_depth=3, options=drawn_by(mixed=4))
     direct = visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.1)
-    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
+    known = gather.apply(direct.columns(np.arange(384))[..., 0])
     missing = relative(found.columns(np.arange(384)), known)
     assert max(found.ranks) < 70
     assert missing == pytest.approx(found.left_out, rel=0.25)
@@ -316,7 +316,7 @@ def test_a_basis_has_an_end(coloured_scene):
     gather = solver(coloured_scene, 8, max_depth=3, options=drawn_by(most=16))
     direct = visibility(coloured_scene, 8)
     found = gather.indirect(direct, tolerance=0.001)
-    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(384))[..., 0])
+    known = gather.apply(direct.columns(np.arange(384))[..., 0])
     assert max(found.ranks) <= 16 + 96  # combinations join by blocks
     assert found.left_out > 0.01
     missing = relative(found.columns(np.arange(384)), known)
@@ -369,7 +369,7 @@ def test_least_squares_from_some_rows():
     basis = RandomBasis(few_rows=16, sums=512)
     gather, direct = solver(scene, 4, max_depth=3, options=LowRankOptions(basis)), visibility(scene)
     found = gather.indirect(direct, tolerance=0.1)
-    known = gather.apply(gather.contacts.lit(direct).columns(np.arange(96))[..., 0])
+    known = gather.apply(direct.columns(np.arange(96))[..., 0])
     assert scene.n_vertices > 1500
     assert basis.rows * sum(found.ranks) < scene.n_vertices / 2
     assert relative(found.columns(np.arange(96)), known) == pytest.approx(found.left_out, rel=0.33)

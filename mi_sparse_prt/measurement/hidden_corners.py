@@ -1,0 +1,150 @@
+"""Corners of triangles behind a wall: one that passes through a triangle has light on one side, and other on the other.
+
+Light is known at vertices, and interpolated between them. Of a floor that goes on below a wall, a triangle under the
+wall has corners on both sides of it; what lies on one side is lit by the corners on that side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from weakref import WeakKeyDictionary
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene.scene import Scene
+
+TRIANGLES = 1 << 20  # at a time
+SHORT = 0.99  # of the way to a corner: what is met beyond hides nothing
+
+_KNOWN: WeakKeyDictionary[Scene, HiddenCorners] = WeakKeyDictionary()
+
+
+def hidden_corners(scene: Scene) -> HiddenCorners:
+    """Those of a scene; the same ones each time."""
+    if scene not in _KNOWN:
+        _KNOWN[scene] = HiddenCorners(scene)
+    return _KNOWN[scene]
+
+
+class HiddenCorners:
+    """Which corners of its triangle a wall hides from a point on it.
+
+    Triangles are those of all shapes, shape after shape; points and normals are in the normalised frame.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Attributes
+    ----------
+    some : bool
+        Whether there is any wall.
+
+    Notes
+    -----
+    A wall passes through two edges of a triangle, and leaves one corner alone. What passes through one edge ends within
+    the triangle, and hides nothing.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene.normalised
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
+        self._corners = mi.Point3f(vertex_points(scene).positions[triangles.ravel()].T)
+        cut = np.zeros(len(triangles), bool)
+        for a in range(0, len(triangles), TRIANGLES):
+            part = slice(a, min(a + TRIANGLES, len(triangles)))
+            index = dr.arange(mi.UInt32, part.start, part.stop)
+            cut[part] = self._crossed(index).numpy()
+        self.some = bool(cut.any())
+        self._cut = mi.Bool(cut)
+
+    def weights(
+        self,
+        triangle: mi.UInt32,
+        point: mi.Point3f,
+        normal: mi.Vector3f,
+        weights: Sequence[mi.Float],
+        active: mi.Mask,
+    ) -> list[mi.Float]:
+        """Barycentric weights of points, those of hidden corners 0 where another one is seen; they add to 1.
+
+        Parameters
+        ----------
+        triangle : UInt32
+        point : Point3f
+        normal : Vector3f
+            Of the triangle, on the side that is met.
+        weights : three Float
+        active : Mask
+        """
+        cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
+        seen = [~self._hides(3 * triangle + k, point, normal, cut) for k in range(3)]
+        none = ~(seen[0] | seen[1] | seen[2])
+        kept = [dr.select(k | none, dr.maximum(w, 1e-6), 0) for k, w in zip(seen, weights, strict=True)]
+        total = kept[0] + kept[1] + kept[2]
+        return [dr.select(cut, some / total, w) for some, w in zip(kept, weights, strict=True)]
+
+    def choose(
+        self,
+        triangle: mi.UInt32,
+        point: mi.Point3f,
+        normal: mi.Vector3f,
+        weights: Sequence[mi.Float],
+        u: mi.Float,
+        active: mi.Mask,
+    ) -> mi.UInt32:
+        """A corner, 0 to 2, that u in [0, 1) chooses by ``weights``, see there."""
+        cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
+        first, rest = _chosen(weights, u)
+        second, third = (first + 1) % 3, (first + 2) % 3
+        a, b = _weight(weights, second), _weight(weights, third)
+        swapped = rest * (a + b) >= a
+        second, third = dr.select(swapped, third, second), dr.select(swapped, second, third)
+        hidden = self._hides(3 * triangle + first, point, normal, cut)
+        twice = hidden & self._hides(3 * triangle + second, point, normal, hidden)
+        all_of_them = twice & self._hides(3 * triangle + third, point, normal, twice)
+        best = dr.select(twice & ~all_of_them, third, second)
+        return dr.select(hidden & ~all_of_them, best, first)
+
+    def _hides(self, corner: mi.UInt32, point: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:
+        """Whether something hides corners of triangles from points on these."""
+        return active & self._blocked(
+            point, dr.gather(mi.Point3f, self._corners, corner, active), normal, active
+        )
+
+    def _crossed(self, triangle: mi.UInt32) -> mi.Mask:
+        """Whether walls pass through at least two edges, on one side of triangles."""
+        p, normal = self._placed(triangle)
+        crossed = dr.zeros(mi.Mask, dr.width(triangle))
+        for side in (normal, -normal):
+            starts = [dr.lerp(p[k - 1], p[k], 1 - SHORT) for k in range(3)]
+            a, b, c = (self._blocked(starts[k], p[k], side, mi.Mask(True)) for k in range(3))
+            crossed |= (a & b) | (b & c) | (c & a)
+        return crossed
+
+    def _placed(self, triangle: mi.UInt32) -> tuple[list[mi.Point3f], mi.Vector3f]:
+        """The corners of triangles, and their normals."""
+        p = [dr.gather(mi.Point3f, self._corners, 3 * triangle + k) for k in range(3)]
+        return p, dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
+
+    def _blocked(self, start: mi.Point3f, end: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:
+        """Whether something is in the way from a point to a corner, just above the triangle that both are on."""
+        lifted = dr.fma(normal, (1 + dr.max(dr.abs(start))) * mi.math.RayEpsilon, start)
+        ray = mi.Ray3f(lifted, end - start)
+        ray.maxt = mi.Float(SHORT)
+        return self._scene.ray_test(ray, active)
+
+
+def _chosen(weights: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """The corner that u chooses, and what is left of u: again a number in [0, 1)."""
+    ends = weights[1], weights[1] + weights[2]
+    corner = dr.select(u < ends[0], 1, dr.select(u < ends[1], mi.UInt32(2), 0))
+    start = dr.select(corner == 1, 0, dr.select(corner == 2, ends[0], ends[1]))
+    return corner, (u - start) / dr.maximum(_weight(weights, corner), 1e-9)
+
+
+def _weight(weights: Sequence[mi.Float], corner: mi.UInt32) -> mi.Float:
+    return dr.select(corner == 0, weights[0], dr.select(corner == 1, weights[1], weights[2]))
