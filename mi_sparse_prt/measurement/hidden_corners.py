@@ -65,7 +65,7 @@ class HiddenCorners:
         self,
         triangle: mi.UInt32,
         point: mi.Point3f,
-        normal: mi.Vector3f,
+        way: mi.Vector3f,
         weights: Sequence[mi.Float],
         active: mi.Mask,
     ) -> list[mi.Float]:
@@ -75,13 +75,13 @@ class HiddenCorners:
         ----------
         triangle : UInt32
         point : Point3f
-        normal : Vector3f
-            Of the triangle, on the side that is met.
+        way : Vector3f
+            Of the ray that met it there: on which side of the triangle it is.
         weights : three Float
         active : Mask
         """
         cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
-        seen = [~self._hides(3 * triangle + k, point, normal, cut) for k in range(3)]
+        seen = [~self._hides(3 * triangle + k, point, self._side(triangle, way, cut), cut) for k in range(3)]
         none = ~(seen[0] | seen[1] | seen[2])
         kept = [dr.select(k | none, dr.maximum(w, 1e-6), 0) for k, w in zip(seen, weights, strict=True)]
         total = kept[0] + kept[1] + kept[2]
@@ -91,23 +91,45 @@ class HiddenCorners:
         self,
         triangle: mi.UInt32,
         point: mi.Point3f,
-        normal: mi.Vector3f,
+        way: mi.Vector3f,
         weights: Sequence[mi.Float],
         u: mi.Float,
         active: mi.Mask,
     ) -> mi.UInt32:
         """A corner, 0 to 2, that u in [0, 1) chooses by ``weights``, see there."""
-        cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
         first, rest = _chosen(weights, u)
+        return dr.if_stmt(  # few are cut, and ask for more rays
+            (triangle, mi.Point3f(point), mi.Vector3f(way), list(weights), first, rest),
+            active & dr.gather(mi.Bool, self._cut, triangle, active),
+            self._first_seen,
+            lambda triangle, point, way, weights, first, rest: first,
+        )
+
+    def _first_seen(
+        self,
+        triangle: mi.UInt32,
+        point: mi.Point3f,
+        way: mi.Vector3f,
+        weights: list[mi.Float],
+        first: mi.UInt32,
+        rest: mi.Float,
+    ) -> mi.UInt32:
+        """The first corner if it is seen; else one of the others, by what is left of a random number."""
+        every = mi.Mask(True)
+        normal = self._side(triangle, way, every)
         second, third = (first + 1) % 3, (first + 2) % 3
         a, b = _weight(weights, second), _weight(weights, third)
         swapped = rest * (a + b) >= a
         second, third = dr.select(swapped, third, second), dr.select(swapped, second, third)
-        hidden = self._hides(3 * triangle + first, point, normal, cut)
+        hidden = self._hides(3 * triangle + first, point, normal, every)
         twice = hidden & self._hides(3 * triangle + second, point, normal, hidden)
-        all_of_them = twice & self._hides(3 * triangle + third, point, normal, twice)
-        best = dr.select(twice & ~all_of_them, third, second)
-        return dr.select(hidden & ~all_of_them, best, first)
+        none = twice & self._hides(3 * triangle + third, point, normal, twice)
+        return dr.select(none | ~hidden, first, dr.select(twice, third, second))
+
+    def _side(self, triangle: mi.UInt32, way: mi.Vector3f, active: mi.Mask) -> mi.Vector3f:
+        """Normals of triangles on the side that rays meet."""
+        _, normal = self._placed(triangle, active)
+        return dr.mulsign(normal, -dr.dot(normal, way))
 
     def _hides(self, corner: mi.UInt32, point: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:
         """Whether something hides corners of triangles from points on these."""
@@ -117,7 +139,7 @@ class HiddenCorners:
 
     def _crossed(self, triangle: mi.UInt32) -> mi.Mask:
         """Whether walls pass through at least two edges, on one side of triangles."""
-        p, normal = self._placed(triangle)
+        p, normal = self._placed(triangle, mi.Mask(True))
         crossed = dr.zeros(mi.Mask, dr.width(triangle))
         for side in (normal, -normal):
             starts = [dr.lerp(p[k - 1], p[k], 1 - SHORT) for k in range(3)]
@@ -125,9 +147,9 @@ class HiddenCorners:
             crossed |= (a & b) | (b & c) | (c & a)
         return crossed
 
-    def _placed(self, triangle: mi.UInt32) -> tuple[list[mi.Point3f], mi.Vector3f]:
+    def _placed(self, triangle: mi.UInt32, active: mi.Mask) -> tuple[list[mi.Point3f], mi.Vector3f]:
         """The corners of triangles, and their normals."""
-        p = [dr.gather(mi.Point3f, self._corners, 3 * triangle + k) for k in range(3)]
+        p = [dr.gather(mi.Point3f, self._corners, 3 * triangle + k, active) for k in range(3)]
         return p, dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
 
     def _blocked(self, start: mi.Point3f, end: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:

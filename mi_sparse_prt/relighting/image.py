@@ -158,8 +158,7 @@ class RelitScene:
         weights = [1 - u - v, u, v]
         if self._hidden.some:
             place = (si.p - self._centre) * self._scale
-            lit = dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d))
-            weights = self._hidden.weights(triangle, place, lit, weights, valid)
+            weights = self._hidden.weights(triangle, place, ray.d, weights, valid)
         return list(zip(vertices, weights, strict=True)), valid
 
     def _shaded(

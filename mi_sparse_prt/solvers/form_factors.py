@@ -115,9 +115,7 @@ class Surfaces:
             normal += weight * dr.gather(mi.Vector3f, self._normals, corner, valid)
         front = dr.dot(normal, ray.d) < 0  # of the shading normal, as for Mitsuba's BSDFs
         if self._hidden.some:
-            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, valid)
-            lit = dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d))
-            k = self._hidden.choose(triangle, si.p, lit, weights, u, valid)
+            k = self._hidden.choose(triangle, ray(hit.t), ray.d, weights, u, valid)
         else:
             k = dr.select(u < b[0], 1, dr.select(u < b[0] + b[1], mi.UInt32(2), 0))
         chosen = dr.select(k == 1, corners[1], dr.select(k == 2, corners[2], corners[0]))

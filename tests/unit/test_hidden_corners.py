@@ -50,7 +50,7 @@ def test_corners_on_the_same_side():
     side = si.p.numpy()[0] / scene.scale + scene.centre[0] > X
     same = (corners > X) == side[:, None]  # [point, corner]
     given, found = (np.stack([w.numpy() for w in some], -1) for some in (
-        weights, hidden.weights(triangle, si.p, si.n, weights, every)
+        weights, hidden.weights(triangle, si.p, -si.n, weights, every)
     ))  # fmt: skip
     cut = ~same.all(axis=1)
     assert 0.02 < cut.mean() < 0.3
@@ -58,10 +58,10 @@ def test_corners_on_the_same_side():
     expected = given * same
     np.testing.assert_allclose(found[cut], (expected / expected.sum(axis=1, keepdims=True))[cut], atol=1e-3)
     for u in (0.0, 0.3, 0.6, 0.999):
-        chosen = hidden.choose(triangle, si.p, si.n, weights, mi.Float(u), every).numpy()
+        chosen = hidden.choose(triangle, si.p, -si.n, weights, mi.Float(u), every).numpy()
         assert same[np.arange(len(same)), chosen].all()
     rng = mi.PCG32(dr.width(triangle))
-    chosen = hidden.choose(triangle, si.p, si.n, weights, rng.next_float32(), every).numpy()
+    chosen = hidden.choose(triangle, si.p, -si.n, weights, rng.next_float32(), every).numpy()
     for k in range(3):
         share = found[cut, k]
         error = np.sqrt((share * (1 - share)).sum())
