@@ -29,9 +29,8 @@ from mi_sparse_prt.scene.materials import Material, bsdf_class
 from mi_sparse_prt.scene.notes import Fact, Notes, listed
 from mi_sparse_prt.scene.scene import Scene
 
-TOO_NARROW = (
-    0.1  # error of images from which factors are left out, and cameras follow rays: a diffuse surface has 1
-)
+TOO_NARROW = 0.5  # error of factors that are left out: a diffuse surface in their place has 1
+BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
     ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
@@ -133,7 +132,7 @@ class _Choice:
         if error > self._bound:
             self._off.setdefault(f"{kind}, {error:.1%}", []).extend(names)
         if error > FOLLOWED * self._bound:
-            few, _ = factors_for_images(material.bsdf, names[0], TOO_NARROW)
+            few, _ = factors_for_images(material.bsdf, names[0], BETWEEN)
             return replace(few, followed=True)
         return found
 
