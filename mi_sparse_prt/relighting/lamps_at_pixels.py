@@ -19,7 +19,7 @@ class LampLitIntegrator(RelitIntegrator):
 
     The latter is Mitsuba's ``path`` of ``max_depth`` 2 among the lamps alone: shadow rays and rays of the BSDF at every
     sample of a pixel, on the shapes as the scene has them. Mirrors, glass and masks on the way to a surface are no
-    reflections in this sense.
+    reflections in this sense, nor are those on the way to an area lamp, which rays of the BSDF meet or not.
 
     Parameters
     ----------
@@ -42,6 +42,7 @@ class LampLitIntegrator(RelitIntegrator):
         self._direct = mi.load_dict({"type": "path", "max_depth": 2})
         self._followed, self._max_depth = relit[-1].followed, max_depth
         self._goes_on = has_mirrors(scene) or bool(self._followed)
+        self._caustics = has_mirrors(scene) and any(shape.is_emitter() for shape in scene.shapes())
 
     def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         value, valid = super()._radiance(ray, sampler, active)
@@ -59,7 +60,31 @@ class LampLitIntegrator(RelitIntegrator):
         direct, _, _ = self._direct.sample(self._scene, sampler, mi.RayDifferential3f(ray), None, reflects)
         before = reflects & (way.depth > 0)
         direct -= dr.select(before, si.emitter(self._scene, before).eval(si, before), 0)
-        return Seen(direct, si, is_one_of(self._followed, si))
+        whole = is_one_of(self._followed, si)
+        if self._caustics:
+            direct += self._by_mirrors(si, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
+        return Seen(direct, si, whole)
+
+    def _by_mirrors(
+        self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
+    ) -> mi.Color3f:
+        """What surfaces reflect of lamps whose light came by mirrors and glass; ``depth`` surfaces count already."""
+        smooth = mi.BSDFContext()
+        smooth.type_mask = int(mi.BSDFFlags.Smooth)  # single directions are followed anyway
+        active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+        u, v = sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
+        sample, weight = si.bsdf().sample(smooth, si, u, v, active)
+        limit = dr.opaque(mi.UInt32, self._max_depth if self._max_depth >= 0 else 1 << 31)
+
+        def emitted(ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
+            met = self._scene.ray_intersect(ray, active)
+            lit = active & (way.depth > 0) & (depth + way.depth < limit)
+            radiance = met.emitter(self._scene, lit).eval(met, lit)
+            return Seen(dr.select(lit, radiance, 0), met, mi.Mask(False))
+
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth)
+        return dr.select(active, weight * found, 0)
 
 
 def without_environment(scene: mi.Scene) -> mi.Scene:

@@ -5,11 +5,12 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, assert_same, build, diffuse
+from conftest import T, assert_same, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import relative_l2_without_noise
 from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
 LIGHTING = prt.CubemapLighting(8)
@@ -89,6 +90,38 @@ def test_rough_conductor():
     noises = [float(np.abs(a - b)[inside].mean()) for a, b in pairs]
     print("noise of rays and of factors", noises)
     assert noises[1] < 0.1 * noises[0]
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_what_narrow_lobes_send_to_a_wall():
+    """
+    Rationale: pictures show a polished metal by rays that go on; what it throws on a wall is blurred there, and 16
+        factors of it are enough.
+    Expected: under a low sun, indirect light of a wall over such a floor is that of paths, of the real metal, within 2%
+        and four standard errors; with the floor as a diffuse one of the same albedo, it is less than half of that.
+    Result: 0.9% more (noise 0.6%); 78% less.
+    """
+    polished = {"type": "roughconductor", "material": "Al", "alpha": 0.12}
+    scene = build(
+        0.15,
+        floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": polished},
+        wall={"type": "rectangle", "to_world": T().translate([0, 1, -1]), "bsdf": diffuse(0.7, 0.7, 0.7)},
+    )
+    d = LIGHTING.directions
+    sun = ((d @ np.array([0, 0.4, 0.9]) / 0.985) > 0.95).astype(np.float32)[:, None] * np.ones(3, np.float32)
+    wall = np.arange(scene.n_vertices)[scene.meshes[1].vertices][::7]
+    texels = np.flatnonzero(sun[:, 0])
+    place = np.repeat(wall, len(texels)), np.tile(texels, len(wall))
+    paths = PathSolver(problem_at(scene, LIGHTING, basis="texel", max_depth=3), 1024).elements(*place)
+    power = LIGHTING.solid_angles[place[1]][:, None]
+    known, error = (paths.mean * power).sum(), np.sqrt((paths.variance * power**2).sum())
+    ours = {}
+    for terms in ("auto", 0):
+        indirect = computed(scene, terms, 3).operators["indirect"].elements(*place)
+        ours[terms] = float(np.broadcast_to(indirect, paths.mean.shape).sum() / known - 1)
+    print(f"auto {ours['auto']:+.2%}, as diffuse {ours[0]:+.2%}, noise {error / known:.2%}")
+    assert abs(ours["auto"]) < 0.02 + 4 * error / known
+    assert ours[0] < -0.5
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
