@@ -44,10 +44,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "SCENE": "cornell",
         "RESOLUTION": 4,
         "EDGE_LENGTH": 1e9,
-        "REFERENCE_SPP": 64,
+        "REFERENCE_SPP": 16,
         "METHODS": ["k_means_columns", "gather"],
     },
     "04_glossy_and_compression": {
+        "SCENE": "glossy_spot",
         "RESOLUTION": 4,
         "EDGE_LENGTH": 1e9,
         "TERMS": 2,

@@ -95,7 +95,8 @@ def error(ours: list[np.ndarray], theirs: list[np.ndarray]) -> float:
 
 
 @pytest.mark.parametrize("hide", [False, True])
-@pytest.mark.parametrize("light", ["sky", "panel", "both"])
+# each light alone is in the other two
+@pytest.mark.parametrize("light", ["sky", "panel", pytest.param("both", marks=pytest.mark.slow)])
 def test_alpha_and_hidden_emitters(integrator: dict, light: str, hide: bool) -> None:
     """
     Rationale: an image is put in front of another by its alpha; hidden lamps do not stand in the way.

@@ -50,7 +50,7 @@ def test_every_plan_is_carried_out_that_may_be_as_quick():
         was left out is slower by prediction; all that ``"auto"`` does takes longer than the plan alone.
     """
     report = measure_plans(
-        build(0.4, **still_life(GREY)), prt.CubemapLighting(8), progress=False, targets=(0.1, 0.04)
+        build(0.4, **still_life(GREY)), prt.CubemapLighting(4), progress=False, targets=(0.1, 0.04)
     )
     assert json.loads(json.dumps(report)) == report
     names = [(p["direct"], p["indirect"], tuple(p["parameters"].items())) for p in report["plans"]]
