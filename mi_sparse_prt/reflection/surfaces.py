@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.reflection.brdf_factors import (
+    MOST_TERMS,
     BrdfFactors,
     UnfactorableError,
     diffuse_reflectance,
@@ -31,6 +32,7 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
+ROWS = 160_000  # of 16 factors at most; where there would be more, narrow lobes are left out: form factors take too much
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
     ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
@@ -93,7 +95,12 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
     Reflection
         ``Diffuse`` if no surface has factors.
     """
-    choice = _Choice(bound)
+    glossy = sum(
+        mesh.vertices.stop - mesh.vertices.start
+        for mesh, material in zip(scene.meshes, scene.materials, strict=True)
+        if material.glossy
+    )
+    choice = _Choice(bound, TOO_NARROW if MOST_TERMS * glossy <= ROWS else BETWEEN)
     found = _with_factors(scene, choice.factors)
     choice.warn()
     return Diffuse(scene.albedo) if found is None else found
@@ -106,10 +113,12 @@ class _Choice:
     ----------
     bound : float
         See ``chosen_reflection``.
+    too_narrow : float
+        Error of factors from which there are none.
     """
 
-    def __init__(self, bound: float) -> None:
-        self._bound = bound
+    def __init__(self, bound: float, too_narrow: float) -> None:
+        self._bound, self._too_narrow = bound, too_narrow
         self._left: dict[str, list[str]] = {}  # names of surfaces, by why no factors stand for them
         self._off: dict[str, list[str]] = {}  # by kind of BSDF and error
 
@@ -126,7 +135,7 @@ class _Choice:
         except UnfactorableError as problem:
             self._left.setdefault(problem.reason.removeprefix("BSDF "), []).extend(names)
             return None
-        if error > TOO_NARROW:
+        if error > self._too_narrow:
             self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > self._bound:
