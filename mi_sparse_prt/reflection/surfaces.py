@@ -32,7 +32,7 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-ROWS = 160_000  # of 16 factors at most; where there would be more, narrow lobes are left out: form factors take too much
+ROWS = 160_000  # of 16 factors at most; narrow lobes with more are left out, their form factors take too much memory
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
     ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
