@@ -18,7 +18,7 @@ from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.paths import PathSolver
 
-KERNELS = 300e6  # compiled code and wavefronts of rays, however large the scene
+KERNELS = 270e6  # compiled code and wavefronts of rays: 90 to 560 MB, the middle of seven runs in ratio
 PILOT = 512  # vertices whose rays are counted
 RANK = 5.0  # of a first bounce, times its tolerance: 3 to 11 in scenes of few and of many colours and shapes
 COMBINATIONS = 1.3  # vectors of a random basis for each of the rank, as the last of the energy takes many ...
