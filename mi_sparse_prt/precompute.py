@@ -384,9 +384,10 @@ def _proposals(
     settings: Settings, costs: Costs | None, specular: float, clock: Stopwatch
 ) -> RefinementSchedule | CandidatePlans:
     """The plans to try, ranked by what was measured, if anything was; ``specular`` is an error of all."""
+    elapsed = clock.report()["total"]
     if costs is None:
-        return refinement_schedule(settings)
-    costs = replace(costs, fixed=costs.fixed + clock.report()["total"], specular=specular)
+        return refinement_schedule(settings, elapsed)
+    costs = replace(costs, fixed=costs.fixed + elapsed, specular=specular)
     return CandidatePlans(costs, settings)
 
 

@@ -163,10 +163,12 @@ class Execution:
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
         """With interreflections among glossy surfaces."""
         with self._run.clock.phase("interreflection"):
-            seed = self._run.seed
+            problem, seed = self._problem, self._run.seed
+            nodes = choose_nodes(problem.scene, problem.points)
             specular = None if light.specular is None else light.specular.operator
-            part, noise = glossy_indirect(self._problem, direct, plan.rays, plan.tolerance, seed, specular)
-        rays = light.rays | {"gather": len(self._problem.points) * plan.rays}
+            part, noise = glossy_indirect(problem, direct, plan.rays, plan.tolerance, nodes, seed, specular)
+        starts = len(np.union1d(nodes.ids, direct.glossy))
+        rays = light.rays | {"gather": starts * plan.rays}
         account = _account(part) | {"noise_of_rays": noise}
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=account)
 

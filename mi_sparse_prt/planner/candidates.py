@@ -11,6 +11,7 @@ from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import (
+    MINIMUM_GAIN,
     Costs,
     Predicted,
     better,
@@ -28,11 +29,15 @@ TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take 
 
 
 class RefinementSchedule:
-    """Plans in turn.
+    """Plans in turn, as long as the next one can be clearly more exact, and takes sensible time.
 
     Parameters
     ----------
     plans : sequence of Plan
+    limit : float
+        Seconds, in all, that a next one is not to exceed.
+    started : float
+        Seconds before the first plan.
 
     Attributes
     ----------
@@ -47,15 +52,25 @@ class RefinementSchedule:
     seconds: float | None = None
     too_long: Predicted | None = None
 
-    def __init__(self, plans: Sequence[Plan]) -> None:
+    def __init__(self, plans: Sequence[Plan], limit: float = math.inf, started: float = 0.0) -> None:
         self.plan, *self._others = plans
+        self._limit, self._started = limit, started
 
     def after(self, found: HeldOutError, elapsed: float) -> bool:
-        """Go on to the next plan, the present one having this error after so many seconds; False if none is left."""
-        if self._others:
-            self.plan = self._others.pop(0)
-            return True
-        return False
+        """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
+
+        More rays make light more exact that is gathered, and no other.
+        """
+        if not self._others:
+            return False
+        before, following = self.plan, self._others[0]
+        if before.indirect == following.indirect == "gather" and before.direct == following.direct:
+            more = following.rays / before.rays
+            least = math.sqrt(max(found.total**2 - found.parts["indirect"] ** 2 * (1 - 1 / more), 0.0))
+            if least > MINIMUM_GAIN * found.total or elapsed + more * (elapsed - self._started) > self._limit:
+                return False
+        self.plan, self._started = self._others.pop(0), elapsed
+        return True
 
     def report(self) -> list[dict[str, Any]]:
         """Plans that were compared."""
@@ -183,12 +198,14 @@ def error_without_noise(found: Sequence[tuple[Plan, float]]) -> float:
     return math.sqrt(max(rest, 0.0))
 
 
-def refinement_schedule(settings: Settings) -> RefinementSchedule:
-    """The plan of a method; with a target error, from the coarsest of its plans on."""
+def refinement_schedule(settings: Settings, started: float) -> RefinementSchedule:
+    """The plan of a method; with a target error, from the coarsest of its plans on, after so many seconds."""
+    plans: Sequence[Plan]
     if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
-        return RefinementSchedule([settings.with_shares(plan) for plan in EFFORTS["gather"]])
-    if settings.target_error is None or isinstance(settings.method, Plan):
-        return RefinementSchedule([settings.plan])
-    return RefinementSchedule(
-        [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
-    )
+        plans = [settings.with_shares(plan) for plan in EFFORTS["gather"]]
+    elif settings.target_error is None or isinstance(settings.method, Plan):
+        plans = [settings.plan]
+    else:
+        plans = [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
+    limit = settings.max_seconds if settings.method == "auto" else math.inf
+    return RefinementSchedule(plans, limit, started)

@@ -21,6 +21,7 @@ from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.solvers.stacked import StackedFormFactors
 
 PRECISION = 1e-4  # relative, of the least vectors in a basis of float32 numbers
 ROWS = 1 << 12  # of blocks of columns that are side by side at a time: a few megabytes
@@ -96,7 +97,7 @@ class FirstBounce:
 
 
 def first_bounce(
-    matrix: scipy.sparse.csr_array,
+    matrix: StackedFormFactors,
     albedo: Floats,
     direct: Operator,
     keys: NDArray[np.uint64],
@@ -108,7 +109,7 @@ def first_bounce(
 
     Parameters
     ----------
-    matrix : (n, n_v) sparse float32
+    matrix : StackedFormFactors (n, n_v)
         G.
     albedo : (channels, n_v) float32
     direct : Operator
@@ -132,12 +133,12 @@ def first_bounce(
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
-    right = [fit @ known for known in _rows(matrix[rows], albedo, direct)]
+    right = [fit @ known for known in _rows(matrix.rows(rows), albedo, direct)]
     return _truncated(columns, turn, right, missed, tolerance)
 
 
 def _basis(
-    matrix: scipy.sparse.csr_array,
+    matrix: StackedFormFactors,
     albedo: Floats,
     direct: Operator,
     hashes: NDArray[np.uint64],
@@ -192,7 +193,7 @@ def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | No
 
 
 def _combinations(
-    matrix: scipy.sparse.csr_array,
+    matrix: StackedFormFactors,
     albedo: Floats,
     direct: Operator,
     mixed: Floats,
@@ -207,7 +208,7 @@ def _combinations(
     for rho in albedo:
         for a in range(0, mixed.shape[1], width):
             mixed[:, a : a + width] = random_combinations(direct, few, rng)
-        found.append(multiply_scaled(matrix, rho[None], mixed)[0])
+        found.append(matrix.reflect(rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)
 
 

@@ -7,7 +7,7 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -50,6 +50,7 @@ MOST_NOISE = 0.5  # of the first bounce: a tolerance beyond would leave it out
 EVEN = 1e-6  # relative difference of channels that is none
 
 Floats = NDArray[np.float32]
+LookUp = Callable[[mi.UInt32, mi.Vector3f], list[mi.Float]]  # factors of vertices in directions
 
 
 class GlossyGather(FiniteElements):
@@ -59,12 +60,14 @@ class GlossyGather(FiniteElements):
 
     Parameters
     ----------
-    matrices : sequence of (n, n) sparse float32
+    matrices : sequence of (n_nodes, n) sparse float32
         As for ``FiniteElements``.
     albedo : (n,) float32
         Of the diffuse part of each vertex; 1 for terms.
     problem : Problem
     direct : FactoredVisibility
+    nodes : Nodes
+        See ``nodes_and_terms``.
     seed : int
     """
 
@@ -74,19 +77,13 @@ class GlossyGather(FiniteElements):
         albedo: Floats,
         problem: Problem,
         direct: FactoredVisibility,
+        nodes: Nodes,
         seed: int,
     ) -> None:
         points = problem.points
         term = np.tile(np.arange(1, direct.terms + 1), len(direct.glossy)).astype(np.uint64)
         keys = [points.keys, mix(np.repeat(points.keys[direct.glossy], direct.terms) + term)]
-        super().__init__(
-            matrices,
-            albedo[None],
-            np.concatenate(keys),
-            Nodes(np.arange(direct.shape[0]), None),
-            problem.max_depth,
-            seed,
-        )
+        super().__init__(matrices, albedo[None], np.concatenate(keys), nodes, problem.max_depth, seed)
         self._visibility = direct.visibility
 
     def _count_for(self, direct: Operator) -> int:
@@ -100,35 +97,49 @@ class GlossyGather(FiniteElements):
         """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
         total, count, light = 0.0, 0, even[:, None]
         while count < (self.max_depth - 2 if self.max_depth >= 0 else MOST_BOUNCES):
-            light = self.matrix @ (self._albedo[0][:, None] * light)
-            peak = float(np.abs(light).max(initial=0))
+            found = self.matrix @ (self._albedo[0][:, None] * light)
+            peak = float(np.abs(found).max(initial=0))
             if peak <= NEGLIGIBLE * total or peak == 0:
                 break
-            count, total = count + 1, total + peak
+            count, total, light = count + 1, total + peak, self.nodes.interpolate(found)
         return count
+
+
+def nodes_and_terms(nodes: Nodes, direct: FactoredVisibility) -> Nodes:
+    """Rows that gather light: those of some vertices, between which others interpolate theirs, and of all terms."""
+    n, rows = len(direct.material), direct.shape[0]
+    weights = nodes.weights
+    if weights is not None:
+        weights = scipy.sparse.block_diag([weights, scipy.sparse.eye_array(rows - n)], "csr", np.float32)
+    return Nodes(np.concatenate([nodes.ids, np.arange(n, rows)]), weights)
 
 
 @dataclass(frozen=True)
 class GatherRays:
-    """What rays from all vertices meet, ordered by vertices.
+    """What rays from some vertices meet, vertex after vertex.
 
     Attributes
     ----------
-    point, seen : (m,) int64
-        The vertex that a ray gathers for, and the one it meets.
-    number : (m,) int64
-        Of a ray among those of its vertex, side by side.
-    into : (m, 1 + K) float32
-        Weights in unit-albedo light and in the terms of ``point``, times the number of rays.
-    out : (m, channels * K) float32
+    points : (n,) int64
+        The vertices, ascending.
+    counts : (n,) int64
+        Of their rays that meet a surface.
+    seen : (m,) int32
+        The vertex that each of these meets.
+    half : (m,) bool
+        To which of two halves of the rays it belongs.
+    into : (rays of glossy vertices, K) float32
+        Weights in the terms of its own vertex.
+    out : (rays that meet glossy vertices, channels * K) float32
         g_k of ``seen`` towards the ray's origin.
     per_vertex : int
         Rays, those that meet nothing among them.
     """
 
-    point: NDArray[np.int64]
-    seen: NDArray[np.int64]
-    number: NDArray[np.int64]
+    points: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    seen: NDArray[np.int32]
+    half: NDArray[np.bool_]
     into: Floats
     out: Floats
     per_vertex: int
@@ -139,21 +150,22 @@ class GatherRays:
         From how far two halves of them differ, at some vertices and under random sums of columns.
         ``albedo`` is that of one channel, (n_v,).
         """
-        some = np.argsort(mix(points.keys), kind="stable")[:NOISE_VERTICES]
-        row = np.full(len(points), -1)
+        some = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
+        row = np.full(len(self.points), -1)
         row[some] = np.arange(len(some))
-        own = np.flatnonzero(row[self.point] >= 0)
-        # rays are in Morton's order, so that this is a checkerboard
-        half = (np.bitwise_count(self.number[own]) % 2).astype(np.int64)
+        row = np.repeat(row, self.counts)
+        own = np.flatnonzero(row >= 0)
         shape = 2 * len(some), len(points)
-        place = row[self.point[own]] + half * len(some), self.seen[own]
+        place = row[own] + self.half[own] * len(some), self.seen[own]
         halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
         light = random_combinations(direct.visibility, USUAL.mixed, np.random.default_rng(seed))
         return relative_noise(*np.split(halves @ light, 2))
 
 
-def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: int) -> GatherRays:
-    """Cosine-distributed rays from all vertices.
+def gather_rays(
+    problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: int, points: NDArray[np.int64]
+) -> GatherRays:
+    """Cosine-distributed rays from vertices.
 
     Parameters
     ----------
@@ -164,70 +176,102 @@ def gather_rays(problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: 
     rays_per_vertex : int
         A power of two.
     seed : int
+    points : (n,) integers
+        Vertices, ascending.
     """
     assert isinstance(problem.reflection, InOutFactors)
-    points = problem.points
-    surfaces, arrays, samples = Surfaces(problem.scene), PointArrays(points), sobol(rays_per_vertex)
+    surfaces, arrays, samples = Surfaces(problem.scene), PointArrays(problem.points), sobol(rays_per_vertex)
     lobes = Lobes(problem.reflection, outgoing)
     size = max(1, LANES // rays_per_vertex)
-    hits, into, out = [], [], []
+    blocks = []
     for a in range(0, len(points), size):
-        ids = dr.arange(mi.UInt32, min(size, len(points) - a)) + dr.opaque(mi.UInt32, a)
-        ray, point, u = cosine_rays(arrays, ids, samples, seed)
+        some = points[a : a + size]
+        ray, point, u = cosine_rays(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
         vertex = surfaces.traced(ray, u)
-        weights, values = lobes.incident(point, ray.d), lobes.outgoing(vertex, -ray.d)
-        dr.eval(vertex, weights, values)
-        met = np.flatnonzero(vertex.numpy() < NOTHING)
-        hits.append(
-            np.stack([point.numpy()[met], vertex.numpy()[met], met % rays_per_vertex]).astype(np.int64)
-        )
-        into.append(np.stack([np.ones(len(met), np.float32), *(w.numpy()[met] for w in weights)], axis=1))
-        out.append(np.stack([v.numpy()[met] for v in values], axis=1))
-    point, seen, number = np.concatenate(hits, axis=1)
-    return GatherRays(point, seen, number, np.concatenate(into), np.concatenate(out), rays_per_vertex)
+        dr.eval(vertex, ray.d, point)
+        met = dr.compress(vertex < NOTHING)
+        point, vertex, d = (dr.gather(type(x), x, met) for x in (point, vertex, ray.d))
+        row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
+        blocks.append((
+            np.bincount(row, minlength=len(some)),
+            mi.Int32(vertex).numpy(),
+            np.bitwise_count(number) % 2 == 1,  # rays are in Morton's order, so that this is a checkerboard
+            _of_glossy(lobes, lobes.incident, point, d),
+            _of_glossy(lobes, lobes.outgoing, vertex, -d),
+        ))  # fmt: skip
+    counts, seen, half, into, out = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    return GatherRays(points, counts, seen, half, into, out, rays_per_vertex)
 
 
-def gather_matrix(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
-    """G (n, n) of one channel, over unit-albedo light of all vertices and terms of the glossy ones."""
-    n, terms = len(direct.material), direct.terms
+def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.Vector3f) -> Floats:
+    """Factors (lanes, k) of those lanes, few as a rule, whose vertices are glossy."""
+    lanes = dr.compress(lobes.is_glossy(vertex))
+    if not len(lanes):
+        return np.empty((0, len(look_up(mi.UInt32(0), mi.Vector3f(0, 0, 1)))), np.float32)
+    values = look_up(dr.gather(mi.UInt32, vertex, lanes), dr.gather(mi.Vector3f, direction, lanes))
+    dr.eval(values)
+    return np.stack([value.numpy() for value in values], axis=1)
+
+
+def gather_matrix(
+    direct: FactoredVisibility, rays: GatherRays, channel: int, nodes: NDArray[np.integer]
+) -> scipy.sparse.csr_array:
+    """G of one channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms."""
+    n, terms, rows = len(direct.material), direct.terms, len(nodes) + direct.shape[0] - len(direct.material)
     number = np.full(n, -1)  # of a vertex among the glossy ones
     number[direct.glossy] = np.arange(len(direct.glossy))
+    node = np.full(n, -1)  # and among the nodes
+    node[nodes] = np.arange(len(nodes))
     own = slice(channel * terms, (channel + 1) * terms)
-    entries = 1 + terms * (number[rays.seen] >= 0)  # of a ray, in each row that it is in
-    lengths = np.bincount(rays.point, weights=entries, minlength=n).astype(np.int64)
-    starts = row_starts(np.concatenate([lengths, np.repeat(lengths[direct.glossy], terms)]))
+    first = row_starts(rays.counts)
+    shiny = np.concatenate([[0], np.cumsum(number[rays.seen] >= 0)])[
+        first
+    ]  # rays of points before that meet such
+    entries = np.diff(first) + terms * np.diff(shiny)  # of a point, in each of its rows
+    lengths, glossy = np.zeros(rows, np.int64), number[rays.points] >= 0
+    is_node = node[rays.points] >= 0
+    lengths[node[rays.points[is_node]]] = entries[is_node]
+    lengths[len(nodes) :] = np.repeat(entries[glossy], terms)
+    starts = row_starts(lengths)
     columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
-    first = np.searchsorted(rays.point, np.arange(n + 1))
-    into, out = rays.into / np.float32(rays.per_vertex), np.ascontiguousarray(rays.out[:, own])
-    _fill(first, rays.seen, number, into, out, starts, columns, values)
-    return scipy.sparse.csr_array((values, columns, starts), shape=(direct.shape[0], direct.shape[0]))
+    into = row_starts(np.where(glossy, rays.counts, 0))
+    where = rays.points, first, into, shiny
+    found = rays.into, np.ascontiguousarray(rays.out[:, own]), np.float32(1 / rays.per_vertex)
+    _fill(where, rays.seen, (number, node, len(nodes)), found, starts, columns, values)
+    return scipy.sparse.csr_array((values, columns, starts), shape=(rows, direct.shape[0]))
 
 
 @numba.njit(parallel=True, cache=True)
 def _fill(
-    first: NDArray[np.int64],
-    seen: NDArray[np.int64],
-    number: NDArray[np.int64],
-    into: Floats,
-    out: Floats,
+    where: tuple[NDArray[np.int64], ...],
+    seen: NDArray[np.int32],
+    numbers: tuple[NDArray[np.int64], NDArray[np.int64], int],
+    found: tuple[Floats, Floats, np.float32],
     starts: NDArray[np.int64],
     columns: NDArray[np.int32],
     values: Floats,
 ) -> None:
-    """Rows of each point in turn: unit-albedo light, then its terms; entries of a ray likewise."""
+    """Rows of each point: unit-albedo light, then its terms; entries of a ray likewise."""
+    (points, first, first_into, first_out), (number, node, nodes) = where, numbers
+    into, out, share = found
     n, terms = len(number), out.shape[1]
-    for i in numba.prange(n):
-        for row in range(1 + terms if number[i] >= 0 else 1):
-            at = starts[i] if row == 0 else starts[n + number[i] * terms + row - 1]
+    for i in numba.prange(len(points)):
+        own = number[points[i]]
+        for row in range(1 + terms if own >= 0 else 1):
+            if row == 0 and node[points[i]] < 0:
+                continue
+            at = starts[node[points[i]]] if row == 0 else starts[nodes + own * terms + row - 1]
+            shiny = first_out[i]
             for ray in range(first[i], first[i + 1]):
-                weight = into[ray, row]
+                weight = share if row == 0 else share * into[first_into[i] + ray - first[i], row - 1]
                 columns[at], values[at] = seen[ray], weight
                 at += 1
                 other = number[seen[ray]]
                 if other >= 0:
                     for k in range(terms):
-                        columns[at], values[at] = n + other * terms + k, weight * out[ray, k]
+                        columns[at], values[at] = n + other * terms + k, weight * out[shiny, k]
                         at += 1
+                    shiny += 1
 
 
 def glossy_indirect(
@@ -235,6 +279,7 @@ def glossy_indirect(
     direct: FactoredVisibility,
     rays_per_vertex: int,
     tolerance: float,
+    nodes: Nodes,
     seed: int,
     specular: SparseRows | ByDepth | None = None,
 ) -> tuple[Gathered | GatheredByDepth, float]:
@@ -249,6 +294,8 @@ def glossy_indirect(
         A power of two.
     tolerance : float
         As for ``RadiositySolver.indirect``; no less than the noise of the rays, whose rank is full.
+    nodes : Nodes
+        Vertices that gather unit-albedo light, others interpolate theirs; terms are gathered at all glossy ones.
     seed : int
     specular : SparseRows or ByDepth, optional
         Light from the sky by way of mirrors and glass, which surfaces send on as well. What they send on by way of
@@ -256,13 +303,15 @@ def glossy_indirect(
     """
     albedo, outgoing = _channels(problem.reflection, 1 if specular is None else specular.shape[2])
     ones = np.ones(direct.shape[0] - len(albedo), np.float32)
-    rays = gather_rays(problem, outgoing, rays_per_vertex, seed)
+    points = np.union1d(nodes.ids, direct.glossy)
+    rays = gather_rays(problem, outgoing, rays_per_vertex, seed, points)
     noise = rays.noise(direct, albedo.mean(axis=1), problem.points, seed)
-    after_mirrors = _after_mirrors(problem, direct.shape[0], rays_per_vertex, seed)
+    rows = nodes_and_terms(nodes, direct)
+    after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
     found = []
     for channel, shade in enumerate(albedo.T):
-        matrices = [gather_matrix(direct, rays, channel), *after_mirrors]
-        solver = GlossyGather(matrices, np.concatenate([shade, ones]), problem, direct, seed)
+        matrices = [gather_matrix(direct, rays, channel, nodes.ids), *after_mirrors]
+        solver = GlossyGather(matrices, np.concatenate([shade, ones]), problem, direct, rows, seed)
         own = None if specular is None else _channel(specular, channel)
         found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE)), own))
     return _joined(found), noise
@@ -289,13 +338,15 @@ def _joined(found: list[Gathered | GatheredByDepth]) -> Gathered | GatheredByDep
     )
 
 
-def _after_mirrors(problem: Problem, rows: int, rays: int, seed: int) -> list[scipy.sparse.csr_array]:
-    """G_1, G_2, ... (rows, rows) of unit-albedo rows; none where there are no specular surfaces."""
+def _after_mirrors(
+    problem: Problem, ids: NDArray[np.integer], shape: tuple[int, int], rays: int, seed: int
+) -> list[scipy.sparse.csr_array]:
+    """G_1, G_2, ... of unit-albedo rows, the first ones of this shape; none where there are no specular surfaces."""
     if not problem.specular_apart:
         return []
-    matrices = specular_form_factors(problem, np.arange(len(problem.points)), rays, seed)
+    matrices = specular_form_factors(problem, ids, rays, seed)
     for matrix in matrices:
-        matrix.resize((rows, rows))
+        matrix.resize(shape)
     return matrices
 
 

@@ -37,10 +37,14 @@ class Lobes:
         material[glossy] = reflection.material[glossy]
         turn = np.zeros((n, 3, 3), np.float32)
         turn[glossy] = frames(reflection.tangents[glossy], reflection.normals[glossy])
-        self._material = mi.UInt32(material)
+        self._material, self._dark = mi.UInt32(material), len(tables)
         self._axes = [mi.Vector3f(np.ascontiguousarray(turn[:, k].T)) for k in range(3)]
         self._incident = _with_dark(tables)
         self._outgoing = [] if outgoing is None else [_with_dark(t) for t in outgoing]
+
+    def is_glossy(self, vertex: mi.UInt32) -> mi.Mask:
+        """Whether vertices have terms."""
+        return dr.gather(mi.UInt32, self._material, vertex) != self._dark
 
     def incident(self, vertex: mi.UInt32, direction: mi.Vector3f) -> list[mi.Float]:
         """Terms f_k(w) pi / cos for directions (world) that are cosine-distributed."""

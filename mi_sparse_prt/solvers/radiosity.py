@@ -38,7 +38,7 @@ from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
-from mi_sparse_prt.solvers.stacked import Stacked
+from mi_sparse_prt.solvers.stacked import Stacked, StackedFormFactors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 COLUMNS = 256  # of a dense matrix that G is applied to at a time
@@ -139,12 +139,14 @@ class FiniteElements:
         max_depth: int,
         seed: int,
     ) -> None:
-        self.matrix = (
-            matrices[0] if len(matrices) == 1 else scipy.sparse.csr_array(sum(matrices[1:], matrices[0]))
-        )
         self._matrices, self._albedo, self._keys, self.nodes = matrices, albedo, keys, nodes
         self.max_depth, self.seed = max_depth, seed
         self.channels, self.options = len(albedo), LowRankOptions()
+
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        first, *others = self._matrices
+        return scipy.sparse.csr_array(sum(others, first)) if others else first
 
     def apply(self, columns: Floats) -> Floats:
         """Indirect light under a few lights, without approximation.
@@ -252,9 +254,8 @@ class FiniteElements:
             right = np.zeros((0, direct.shape[1]), np.float32)
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         keys = self._keys[self.nodes.ids]
-        first = first_bounce(
-            self.matrix, self._albedo, direct, keys, tolerance, self.seed, self.options.basis
-        )
+        matrix = StackedFormFactors([self.matrix])
+        first = first_bounce(matrix, self._albedo, direct, keys, tolerance, self.seed, self.options.basis)
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
@@ -274,10 +275,9 @@ class FiniteElements:
         """``_by_depth`` of light of one channel."""
         count = len(lights)
         lit = [t for t, light in enumerate(lights) if t == 0 or not _is_dark(light)]
-        blocks = [[self._matrices[s - t] if t <= s else None for t in lit] for s in range(count)]
         keys = self._keys[self.nodes.ids]
         first = first_bounce(
-            scipy.sparse.block_array(blocks, format="csr"),
+            StackedFormFactors(self._matrices, lit, count),
             np.tile(albedo, len(lit)),
             Stacked(tuple(lights[t] for t in lit)),
             np.concatenate([mix(keys + np.uint64(s)) if s else keys for s in range(count)]),
@@ -467,7 +467,15 @@ class RadiositySolver(FiniteElements):
         matrix = scipy.sparse.csr_array(sum(found[1:], found[0]))
         self.rays += len(points) * self._rays_per_vertex
         lit = direct if specular is None else Sum((direct, specular))
-        first = first_bounce(matrix, self._albedo, lit, points.keys, tolerance, self.seed, self.options.basis)
+        first = first_bounce(
+            StackedFormFactors([matrix]),
+            self._albedo,
+            lit,
+            points.keys,
+            tolerance,
+            self.seed,
+            self.options.basis,
+        )
         specular = Sum(specular.by_depth) if specular is not None and specular.by_depth else specular
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
         assert isinstance(before, Gathered)
