@@ -34,8 +34,6 @@ class RefinementSchedule:
     Parameters
     ----------
     plans : sequence of Plan
-    target : float, optional
-        Error that is to be met.
     limit : float
         Seconds, in all, that a next one is not to exceed.
     started : float
@@ -54,16 +52,9 @@ class RefinementSchedule:
     seconds: float | None = None
     too_long: Predicted | None = None
 
-    def __init__(
-        self,
-        plans: Sequence[Plan],
-        target: float | None = None,
-        limit: float = math.inf,
-        started: float = 0.0,
-    ) -> None:
+    def __init__(self, plans: Sequence[Plan], limit: float = math.inf, started: float = 0.0) -> None:
         self.plan, *self._others = plans
-        self._target, self._limit, self._started = target or 0.0, limit, started
-        self._found = list[tuple[Plan, float]]()
+        self._limit, self._started, self._error = limit, started, math.inf
 
     def after(self, found: HeldOutError, elapsed: float) -> bool:
         """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
@@ -73,16 +64,15 @@ class RefinementSchedule:
         if not self._others:
             return False
         before, following = self.plan, self._others[0]
-        self._found.append((before, found.total))
         if before.indirect == "gather" and _kind(before) == _kind(following):
             more = following.rays / before.rays
             least = math.sqrt(max(found.total**2 - found.parts["indirect"] ** 2 * (1 - 1 / more), 0.0))
             seconds = elapsed + more * (elapsed - self._started)
-            if least > MINIMUM_GAIN * found.total or seconds > self._limit:
+            # the most that more rays can do, and what they did last time
+            helped = max(least / found.total, found.total / self._error) <= MINIMUM_GAIN
+            if not helped or seconds > self._limit:
                 return False
-            if error_without_noise(self._found) > max(self._target, MINIMUM_GAIN * found.total):
-                return False
-        self.plan, self._started = self._others.pop(0), elapsed
+        self.plan, self._started, self._error = self._others.pop(0), elapsed, found.total
         return True
 
     def report(self) -> list[dict[str, Any]]:
@@ -221,4 +211,4 @@ def refinement_schedule(settings: Settings, started: float) -> RefinementSchedul
     else:
         plans = [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
     limit = settings.max_seconds if settings.method == "auto" else math.inf
-    return RefinementSchedule(plans, settings.target_error, limit, started)
+    return RefinementSchedule(plans, limit, started)
