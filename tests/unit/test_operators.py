@@ -20,7 +20,7 @@ from mi_sparse_prt.operators.operator import Masked, Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.operators.stored import operator_arrays, operator_from_arrays
 from mi_sparse_prt.operators.sum import Sum
-from mi_sparse_prt.solvers.stacked import Stacked
+from mi_sparse_prt.solvers.stacked import Stacked, StackedFormFactors
 
 N, M = 50, 96  # points and directions of made_up
 
@@ -348,3 +348,25 @@ def test_rows_below_each_other():
     words, signs = np.array([2, 0]), np.random.default_rng(0).choice([-1, 1], (2, 32)).astype(np.float32)
     wanted = sum(known[:, 32 * w : 32 * w + 32, 0] * sign for w, sign in zip(words, signs, strict=True))
     assert close(both.combined(words, signs), wanted)
+
+
+def test_form_factors_of_several_depths():
+    """
+    Expected: rows of depth s gather G_(s-t) of light of depth t, as in one matrix of all blocks; any rows of it.
+    """
+    rng = np.random.default_rng(0)
+    matrices = [scipy.sparse.random_array((5, 7), density=0.4, format="csr", rng=k) for k in (1, 2, 3)]
+    matrices = [m.astype(np.float32) for m in (*matrices, scipy.sparse.csr_array((5, 7)))]
+    depths, count = (0, 2), 4
+    whole = np.block([
+        [matrices[s - t].toarray() if t <= s else np.zeros((5, 7)) for t in depths] for s in range(count)
+    ])  # fmt: skip
+    albedo = rng.random((2, 14), np.float32)
+    stacked = StackedFormFactors(matrices, depths, count)
+    assert stacked.shape == whole.shape
+    for columns in (3, 20):
+        light = rng.random((14, columns), np.float32)
+        found = stacked.reflect(albedo, light)
+        assert close(found, np.stack([whole @ (rho[:, None] * light) for rho in albedo]))
+    some = np.array([0, 3, 5, 11, 12, 19])
+    assert close(stacked.rows(some).toarray(), whole[some])

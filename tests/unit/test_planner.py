@@ -19,7 +19,7 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.candidates import CandidatePlans, error_without_noise
+from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, error_without_noise
 from mi_sparse_prt.planner.choice import (
     MARGIN,
     Costs,
@@ -598,11 +598,14 @@ def test_specular_light_is_as_exact_as_what_is_beside_it():
 
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
     """Expected: if the second of two plans turns out worse, the matrix and its report are those of the first."""
-    lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3, 0.25, 0.25))
+    lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3))
 
     def judged(problem, transport, stream, target=None, **given):
         found = held_out_error(problem, transport, stream, target, **given)
-        return found if target is None else replace(found, total=next(errors))
+        if target is None:
+            return found
+        total = next(errors)
+        return replace(found, total=total, parts={"direct": 0.0, "indirect": total})
 
     module = importlib.import_module("mi_sparse_prt.precompute")
     monkeypatch.setattr(module, "held_out_error", judged)
@@ -611,3 +614,23 @@ def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
     assert next(errors, None) is None
     assert found.report["plan"]["parameters"]["rays"] == 64
     assert found.report["rays"]["gather"] > 64 * grey_scene.n_vertices
+
+
+def test_plans_in_turn_end_where_rays_do_not_help():
+    """
+    Rationale: four times the rays halve the error of gathered light at best, and direct light has its own.
+    Expected: on to the next plan after an error of indirect light; not after one of direct light, nor after a plan that
+        was not clearly better than the one before, nor where the next one is to take more seconds than there are.
+    """
+
+    def found(direct: float, indirect: float) -> HeldOutError:
+        parts = {"direct": direct, "indirect": indirect}
+        return HeldOutError(math.hypot(direct, indirect), {}, {"total": 0.0}, 100, parts, [])
+
+    plans = [Plan("edges", "gather", rays, tolerance) for rays, tolerance in GATHER]
+    turns = RefinementSchedule(plans, limit=100.0, started=2.0)
+    assert turns.after(found(0.01, 0.1), 4.0) and turns.plan == plans[1]
+    assert not RefinementSchedule(plans).after(found(0.1, 0.03), 4.0)
+    assert not turns.after(found(0.01, 0.095), 10.0) and turns.plan == plans[1]
+    assert turns.after(found(0.01, 0.06), 10.0) and turns.plan == plans[2]
+    assert not turns.after(found(0.01, 0.03), 40.0)  # 4 x 30 s more
