@@ -78,7 +78,7 @@ def _direct(problem: Problem, run: Run, strata: int) -> Floats:
 
 def _seen_from(problem: Problem, light: Floats, rays: int, seed: int) -> Floats:
     """Indirect light (n, m, 3) of points that are no vertices, from light (n_v, m, 3) that vertices receive."""
-    matrix = gather_matrix(problem.scene, problem.points, rays, seed)
+    matrix = gather_matrix(problem.scene, problem.points, rays, seed, max_depth=problem.max_depth)
     albedo = np.ascontiguousarray(problem.scene.albedo.T)
     channels = [
         multiply_scaled(matrix, albedo[c : c + 1], np.ascontiguousarray(light[..., c]))[0] for c in range(3)

@@ -1,6 +1,13 @@
-"""One bounce of light between vertices as a sparse matrix, by rays ([Leh07] 2.5, T_i of eq. 18)."""
+"""One bounce of light between vertices as a sparse matrix, by rays ([Leh07] 2.5, T_i of eq. 18).
+
+Light is interpolated between the corners of triangles, which is right as long as these see about what the points
+between them see. In a gap much narrower than the triangles they do not: a wall is lit at its vertices, and dark where a
+tile is a millimetre before it. There a ray goes on, by chance as the surface reflects, until it is out of the gap.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +21,7 @@ from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.core.sobol import sobol_points
 from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
 
@@ -22,6 +29,11 @@ LANES = 1 << 23  # rays per wavefront
 NOTHING = int(
     np.iinfo(np.int32).max
 )  # in place of a vertex: what a ray meets if it meets no sheet with vertices
+# A gap is narrow if less than this share of the way to the vertex whose light is taken. Of 1, 1/2, 1/4 and 1/10, 1/4
+# had the least error in a kitchen with gaps of 1 mm (indirect light 3.0, 2.8, 2.7 and 3.6% off, 4.5% by interpolation).
+NARROW = 0.25
+TRIES = 8  # to find an open corner of a triangle, of three
+MOST_IN_GAP = 64  # surfaces, where ``max_depth`` sets no limit: white ones keep light for long
 
 
 def gather_matrix(
@@ -30,6 +42,7 @@ def gather_matrix(
     rays_per_vertex: int,
     seed: int = 0,
     nodes: NDArray[np.integer] | None = None,
+    max_depth: int = -1,
 ) -> scipy.sparse.csr_array:
     """G (n, n_v): what cosine-distributed rays from some vertices find, by the vertices of the triangles they hit.
 
@@ -47,6 +60,8 @@ def gather_matrix(
     seed : int
     nodes : (n,) integers, optional
         The vertices that have rows; all if not given.
+    max_depth : int
+        As Mitsuba's ``path``: so many surfaces less 2 light may meet in gaps.
 
     Returns
     -------
@@ -55,7 +70,7 @@ def gather_matrix(
     """
     if rays_per_vertex < 1 or rays_per_vertex & (rays_per_vertex - 1):
         raise PrtError(f"rays_per_vertex {rays_per_vertex} is not a power of two; use 64, 128, 256, ...")
-    surfaces, arrays, samples = Surfaces(scene), PointArrays(points), sobol(rays_per_vertex)
+    surfaces, arrays, samples = Surfaces(scene, max_depth), PointArrays(points), sobol(rays_per_vertex)
     starting = np.arange(len(points)) if nodes is None else nodes
     size = max(1, LANES // rays_per_vertex)
     blocks = []
@@ -70,9 +85,16 @@ def gather_matrix(
 
 
 class Surfaces:
-    """The triangles of a scene on the device, by the numbers of all vertices (``n_vertices``)."""
+    """The triangles of a scene on the device, by the numbers of all vertices (``n_vertices``).
 
-    def __init__(self, scene: Scene) -> None:
+    Parameters
+    ----------
+    scene : Scene
+    max_depth : int
+        As Mitsuba's ``path``, at least 3, or -1.
+    """
+
+    def __init__(self, scene: Scene, max_depth: int = -1) -> None:
         self._scene, self._passes_straight = scene.normalised, scene.passes_straight
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self.n_vertices = scene.n_vertices
@@ -81,18 +103,105 @@ class Surfaces:
         self._normals = mi.Vector3f(scene.normals.T)
         self._hidden = hidden_corners(scene)
         self._backs = mi.UInt32(np.where(scene.backs < 0, NOTHING, scene.backs).astype(np.uint32))
-        dr.eval(self._triangles, self._normals, self._backs)
+        self._positions = mi.Point3f(vertex_points(scene).positions.T)
+        self._albedo = mi.Float(scene.albedo.mean(axis=1))
+        self._most = MOST_IN_GAP if max_depth < 0 else min(max(max_depth - 3, 0), MOST_IN_GAP)
+        dr.eval(self._positions, self._albedo)
 
     def seen_from(
         self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
     ) -> NDArray[np.int32]:
         """A vertex or NOTHING for every sample of each point; samples side by side."""
-        ray, _, u = cosine_rays(points, ids, samples, seed)
-        return mi.Int32(self.traced(ray, u)).numpy()
+        ray, _, u, rng = cosine_rays(points, ids, samples, seed)
+        return mi.Int32(self.traced(ray, u, rng)[0]).numpy()
 
-    def traced(self, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
-        """A vertex or NOTHING for every ray; u in [0, 1) chooses among the corners of a triangle."""
-        return self.corner(self._scene.ray_intersect_preliminary(ray), ray, u)
+    def traced(self, ray: mi.Ray3f, u: mi.Float, rng: mi.PCG32) -> tuple[mi.UInt32, mi.Vector3f]:
+        """A vertex or NOTHING for every ray, and the direction in which it is met.
+
+        u in [0, 1) chooses among the corners of a triangle; the generator's numbers lead out of gaps.
+        """
+        hit = self._scene.ray_intersect_preliminary(ray)
+        vertex = self.corner(hit, ray, u)
+        narrow = self._is_narrow(hit, ray, vertex)
+        return dr.if_stmt(  # few rays end in gaps
+            (ray, hit, vertex, rng), narrow, self._out_of_gap, lambda ray, hit, vertex, rng: (vertex, ray.d)
+        )
+
+    def _is_narrow(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, vertex: mi.UInt32) -> mi.Mask:
+        return (vertex != NOTHING) & (hit.t < NARROW * self._way(hit, ray, vertex))
+
+    def _way(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, vertex: mi.UInt32) -> mi.Float:
+        """From where rays hit to vertices."""
+        return dr.norm(dr.gather(mi.Point3f, self._positions, vertex, vertex != NOTHING) - ray(hit.t))
+
+    def _out_of_gap(
+        self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: mi.UInt32, rng: mi.PCG32
+    ) -> tuple[mi.UInt32, mi.Vector3f]:
+        """Vertices whose light is that of places in narrow gaps, or NOTHING, and the rays' last directions.
+
+        From the place, a ray goes into a random direction. If it is blocked before it is as far as the vertex, what
+        blocks it shines on the place, if chance reflects that. Else the place is lit as a vertex that is as open,
+        which is asked for the same way; of the corners of a triangle some may be deeper in the gap.
+        """
+        most = dr.opaque(mi.UInt32, self._most)
+
+        def go_on(
+            ray: mi.Ray3f,
+            hit: mi.PreliminaryIntersection3f,
+            vertex: mi.UInt32,
+            rng: mi.PCG32,
+            inside: mi.Mask,
+            is_open: mi.Mask,
+            met: mi.UInt32,
+        ) -> tuple[Any, ...]:
+            onward = self._random_ray(ray, hit, vertex, is_open, rng, inside)
+            found = self._scene.ray_intersect_preliminary(onward, active=inside)
+            blocked = inside & found.is_valid() & (found.t < self._way(hit, ray, vertex))
+            again = blocked & is_open & (met < TRIES)
+            albedo = dr.gather(mi.Float, self._albedo, vertex, blocked)
+            reflected = blocked & ~is_open & (rng.next_float32() < albedo) & (met < most)
+            ray, hit = dr.select(reflected, onward, ray), dr.select(reflected, found, hit)
+            absorbed = blocked & ~is_open & ~reflected
+            vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32()), vertex)
+            vertex = dr.select(absorbed, NOTHING, vertex)
+            opened = inside & ~blocked & ~is_open
+            inside = again | opened | (reflected & self._is_narrow(hit, ray, vertex))
+            return (
+                ray,
+                hit,
+                vertex,
+                rng,
+                inside & (vertex != NOTHING),
+                is_open | opened,
+                dr.select(opened, 0, met + 1),
+            )
+
+        state = ray, hit, vertex, rng, mi.Mask(True), mi.Mask(False), mi.UInt32(0)
+        ray, _, vertex, *_ = dr.while_loop(state, lambda *state: state[4], go_on)
+        return vertex, ray.d
+
+    def _random_ray(
+        self,
+        ray: mi.Ray3f,
+        hit: mi.PreliminaryIntersection3f,
+        vertex: mi.UInt32,
+        of_vertex: mi.Mask,
+        rng: mi.PCG32,
+        active: mi.Mask,
+    ) -> mi.Ray3f:
+        """Cosine-distributed rays from vertices or, of other lanes, from where rays hit."""
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        there = active & of_vertex
+        normal = dr.select(
+            of_vertex,
+            dr.gather(mi.Vector3f, self._normals, vertex, there),
+            dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d)),
+        )
+        start = dr.select(of_vertex, dr.gather(mi.Point3f, self._positions, vertex, there), si.p)
+        uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(uv))
+        lifted = dr.fma(normal, (1 + dr.max(dr.abs(start))) * mi.math.RayEpsilon, start)
+        return mi.Ray3f(lifted, direction)
 
     def corner(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
         """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING.
@@ -125,21 +234,25 @@ class Surfaces:
 
 def cosine_rays(
     points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
-) -> tuple[mi.Ray3f, mi.UInt32, mi.Float]:
-    """Cosine-distributed rays from points, samples side by side; each one's point, and a number in [0, 1) for it."""
+) -> tuple[mi.Ray3f, mi.UInt32, mi.Float, mi.PCG32]:
+    """Cosine-distributed rays from points, samples side by side.
+
+    With each one's point, a number in [0, 1) for it, and more random numbers.
+    """
     rays = len(samples[0])
     lane = dr.arange(mi.UInt32, len(ids) * rays)
     row = lane // rays
-    point = dr.gather(mi.UInt32, ids, row)
+    point, sample = dr.gather(mi.UInt32, ids, row), lane - row * rays
     rng = random_generator(points.key(point), mi.UInt32(0), mi.UInt32(0), seed)
     # bits flipped alike for all samples of a point (Owen's digital shift): they stay stratified
     x, y, z = (
-        mi.Float((dr.gather(mi.UInt32, column, lane - row * rays) ^ rng.next_uint32()) >> 8) * 2**-24
+        mi.Float((dr.gather(mi.UInt32, column, sample) ^ rng.next_uint32()) >> 8) * 2**-24
         for column in samples
     )
     local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
     direction = mi.Frame3f(points.normal(point)).to_world(local)
-    return start_ray(points, point, direction), point, z
+    own = random_generator(points.key(point), sample, mi.UInt32(1), seed)
+    return start_ray(points, point, direction), point, z, own
 
 
 def sobol(n: int) -> list[mi.UInt32]:

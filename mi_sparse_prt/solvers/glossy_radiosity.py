@@ -180,24 +180,25 @@ def gather_rays(
         Vertices, ascending.
     """
     assert isinstance(problem.reflection, InOutFactors)
-    surfaces, arrays, samples = Surfaces(problem.scene), PointArrays(problem.points), sobol(rays_per_vertex)
+    surfaces = Surfaces(problem.scene, problem.max_depth)
+    arrays, samples = PointArrays(problem.points), sobol(rays_per_vertex)
     lobes = Lobes(problem.reflection, outgoing)
     size = max(1, LANES // rays_per_vertex)
     blocks = []
     for a in range(0, len(points), size):
         some = points[a : a + size]
-        ray, point, u = cosine_rays(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
-        vertex = surfaces.traced(ray, u)
-        dr.eval(vertex, ray.d, point)
+        ray, point, u, rng = cosine_rays(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
+        vertex, last = surfaces.traced(ray, u, rng)
+        dr.eval(vertex, last, ray.d, point)
         met = dr.compress(vertex < NOTHING)
-        point, vertex, d = (dr.gather(type(x), x, met) for x in (point, vertex, ray.d))
+        point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, ray.d, last))
         row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
         blocks.append((
             np.bincount(row, minlength=len(some)),
             mi.Int32(vertex).numpy(),
             np.bitwise_count(number) % 2 == 1,  # rays are in Morton's order, so that this is a checkerboard
             _of_glossy(lobes, lobes.incident, point, d),
-            _of_glossy(lobes, lobes.outgoing, vertex, -d),
+            _of_glossy(lobes, lobes.outgoing, vertex, -last),
         ))  # fmt: skip
     counts, seen, half, into, out = (np.concatenate(x) for x in zip(*blocks, strict=True))
     return GatherRays(points, counts, seen, half, into, out, rays_per_vertex)

@@ -512,7 +512,7 @@ def form_factors(
     problem: Problem, rays: int, seed: int, ids: NDArray[np.integer]
 ) -> list[scipy.sparse.csr_array]:
     """G_0, G_1, ... (n, n_v) of some of a problem's points, after as many specular surfaces (``FiniteElements``)."""
-    matrix = gather_matrix(problem.scene, problem.points, rays, seed, ids)
+    matrix = gather_matrix(problem.scene, problem.points, rays, seed, ids, problem.max_depth)
     if not problem.specular_apart:
         return [matrix]
     return [matrix, *specular_form_factors(problem, ids, rays, seed)]

@@ -149,10 +149,8 @@ class SpecularChains:
         One matrix after any number of them, where light is not told apart by depth. Weights of colours are averaged.
         """
         n, rays = len(ids), len(samples[0])
-        ray, point, _ = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
-        lane = dr.arange(mi.UInt32, n * rays)
-        row = lane // rays
-        rng = random_generator(self._points.key(point), lane - row * rays, mi.UInt32(1), seed)
+        ray, _, _, rng = cosine_rays(self._points, mi.UInt32(ids.astype(np.uint32)), samples, seed)
+        row = dr.arange(mi.UInt32, n * rays) // rays
         shape = n, self._surfaces.n_vertices
         found = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(max(self._apart - 1, 1))]
         for depth, ends in enumerate(self._follow(ray, row, rng, False)):

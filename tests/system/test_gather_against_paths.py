@@ -9,6 +9,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
+from mi_sparse_prt.solvers import form_factors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
@@ -64,6 +65,38 @@ def test_still_life(artefact):
     assert distance < 0.03**2
     assert (3 * error < 0.01 * known).all()
     assert (np.abs(value - known) < 3 * error + 0.01 * known).all()
+
+
+def test_a_gap_narrower_than_triangles(monkeypatch):
+    """Rationale: a tile that is 1 mm before a wall hides nearly all light from the wall behind it, and triangles of
+    10 cm have vertices beside the tile that see it all.
+
+    The back of the tile under an even sky, `max_depth` 5, against 2 x 256 paths per element (24 texels).
+
+    Expected: the relative L2 error of its light is less than half of what plain interpolation gives.
+    Result: 17%, and 49% by plain interpolation. Without asking whether vertices are open themselves, 46%.
+    """
+    grey = diffuse(0.6, 0.6, 0.6)
+    wall = {"type": "rectangle", "bsdf": grey}
+    tile = {
+        "type": "cube",
+        "to_world": T().translate([0.03, 0.02, 0.021]).scale([0.23, 0.23, 0.02]),
+        "bsdf": grey,
+    }
+    scene, lighting = build(0.1, wall=wall, tile=tile), prt.CubemapLighting(2)
+    points, every = vertex_points(scene), np.arange(scene.n_vertices)
+    problem = problem_at(scene, lighting, points, basis="texel")
+    direct = MeanCosine(DirectSolver(problem, 4).rows(every), lighting)
+    back = np.flatnonzero((scene.normals[:, 2] < -0.9) & (np.abs(scene.positions[:, 2] - 0.001) < 1e-4))
+    power = lighting.solid_angles[:, None]
+    a, b = ((PathSolver(problem, 256, seed=seed).rows(back).mean * power).sum(axis=(1, 2)) for seed in (0, 1))
+    errors = []
+    for narrow in (form_factors.NARROW, 0):
+        monkeypatch.setattr(form_factors, "NARROW", narrow)
+        found = RadiositySolver(problem, 1024).rows(direct, back).sum(axis=(1, 2))
+        errors.append(np.sqrt(max(np.vdot(found - a, found - b), 0) / np.vdot(a, b)))
+    print("{:.1%}, {:.1%} by plain interpolation".format(*errors))
+    assert errors[0] < errors[1] / 2
 
 
 @pytest.mark.filterwarnings("ignore:.*faces point inwards")

@@ -11,6 +11,7 @@ from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.relighting.image import render
+from mi_sparse_prt.solvers import form_factors
 from mi_sparse_prt.solvers.paths import PathSolver
 
 LIGHTING = prt.CubemapLighting(4)
@@ -129,8 +130,10 @@ def test_no_light_leaks(name, direct, basis):
 
 def test_errors_at_a_contact_shrink(monkeypatch):
     """
-    Expected: around the foot of a ball, indirect rows are nearer to paths' than with all corners, by a quarter.
+    Expected: around the foot of a ball, indirect rows are nearer to paths' than with all corners, by a quarter (what
+        narrow gaps are asked for is left out: there that alone has most of the effect).
     """
+    monkeypatch.setattr(form_factors, "NARROW", 0)
     scene, errors = build(0.1, ground=GROUND, ball=BALL), []
     near = np.linalg.norm(scene.positions, axis=1)
     ids = np.flatnonzero((near < 0.35) & (near > 1e-3))
