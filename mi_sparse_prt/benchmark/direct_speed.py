@@ -15,6 +15,7 @@ from mi_sparse_prt.benchmark.measuring import timed
 from mi_sparse_prt.core.profiling import peak_memory, reset_peak_memory
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.scene.ray_offsets import ray_offsets
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import diffuse_problem
@@ -28,7 +29,7 @@ class BareOcclusion:
 
     def __init__(self, scene: mi.Scene, lighting: CubemapLighting, points: Points) -> None:
         self.scene, self.n_directions = scene, lighting.n_directions
-        offset = (1 + np.abs(points.positions).max(axis=1, keepdims=True)) * np.float32(mi.math.RayEpsilon)
+        offset = ray_offsets(points.positions)
         origins = points.positions + offset * points.offset_normals  # [point, xyz]
         self._origins = mi.Point3f(np.ascontiguousarray(origins.T))
         self._normals = mi.Normal3f(np.ascontiguousarray(points.normals.T))

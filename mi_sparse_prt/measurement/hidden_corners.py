@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
 
 TRIANGLES = 1 << 20  # at a time
@@ -154,7 +155,7 @@ class HiddenCorners:
 
     def _blocked(self, start: mi.Point3f, end: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:
         """Whether something is in the way from a point to a corner, just above the triangle that both are on."""
-        lifted = dr.fma(normal, (1 + dr.max(dr.abs(start))) * mi.math.RayEpsilon, start)
+        lifted = dr.fma(normal, ray_offset(start), start)
         ray = mi.Ray3f(lifted, end - start)
         ray.maxt = mi.Float(SHORT)
         return self._scene.ray_test(ray, active)

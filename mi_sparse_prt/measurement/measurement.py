@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_arrays import sparse_from_arrays, sparse_to_arrays
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.scene.ray_offsets import ray_offsets
 from mi_sparse_prt.scene.scene import Scene
 
 Floats = NDArray[np.float32]
@@ -114,7 +114,7 @@ class Measurement:
         if self.normalised is None or self.frame is None:
             raise PrtError("these points were not kept in the file: load_transport(path, scene) has them")
         points, (centre, scale) = self.normalised, self.frame
-        offset = mi.math.RayEpsilon * (1 + np.abs(points.positions).max(axis=1, keepdims=True)) / scale
+        offset = ray_offsets(points.positions) / scale
         world = points.positions / scale + centre
         return SurfacePoints(
             world.astype(np.float32), points.normals, (points.offset_normals * offset).astype(np.float32)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.scene.ray_offsets import ray_offset
 
 
 class PointArrays:
@@ -35,5 +36,4 @@ class PointArrays:
 def start_ray(points: PointArrays, point: mi.UInt32, direction: mi.Vector3f) -> mi.Ray3f:
     """A ray that leaves a measurement point as Mitsuba's ``Interaction.spawn_ray`` does (same offset, same side)."""
     p, n = points.position(point), points.offset_normal(point)
-    offset = (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
-    return mi.Ray3f(dr.fma(n, dr.mulsign(offset, dr.dot(n, direction)), p), direction)
+    return mi.Ray3f(dr.fma(n, dr.mulsign(ray_offset(p), dr.dot(n, direction)), p), direction)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.scene.ray_offsets import ray_offset, ray_offsets
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
 
@@ -40,7 +41,7 @@ def move_off(scene: Scene, positions: Vectors, border: NDArray[np.integer]) -> V
     vertices, normals = vertices[inside], normals[inside]
     if not len(vertices):
         return positions
-    distance = APART * _offsets(positions[vertices])[:, None]
+    distance = APART * ray_offsets(positions[vertices])
     sides = [positions[vertices] + sign * distance * normals for sign in (1, -1)]
     room = [_room(scene, place.astype(np.float32), scene.normals[vertices]) for place in sides]
     moved = positions.copy()
@@ -64,9 +65,9 @@ def _touched(scene: Scene, positions: Vectors) -> tuple[NDArray[np.int64], Vecto
         normal = dr.mulsign(normal, dr.dot(normal, mi.Vector3f(scene.normals[some].sum(axis=1).T)))
         middle, own = (p[0] + p[1] + p[2]) / 3, mi.UInt32(piece[some[:, 0]])
         for column, corner in zip(some.T, p, strict=True):
-            start = dr.fma(normal, (1 + dr.max(dr.abs(middle))) * mi.math.RayEpsilon, middle)
+            start = dr.fma(normal, ray_offset(middle), middle)
             ray = mi.Ray3f(start, corner - middle)
-            beyond = BEYOND * (1 + dr.max(dr.abs(corner))) * mi.math.RayEpsilon / dr.norm(ray.d)
+            beyond = BEYOND * ray_offset(corner) / dr.norm(ray.d)
             ray.maxt = 1 + beyond
             hit = scene.normalised.ray_intersect_preliminary(ray)
             met = first.gather(hit.shape, hit.is_valid()) + hit.prim_index
@@ -81,10 +82,6 @@ def _touched(scene: Scene, positions: Vectors) -> tuple[NDArray[np.int64], Vecto
     return vertices.astype(np.int64), normals[order][chosen]
 
 
-def _offsets(positions: Vectors) -> Vectors:
-    return (1 + np.abs(positions).max(axis=1)) * np.float32(mi.math.RayEpsilon)
-
-
 def _room(scene: Scene, positions: Vectors, normals: Vectors) -> NDArray[np.float32]:
     """How far (n,) rays into the hemispheres of points get on average, at most the longest side of the scene."""
     lane = dr.arange(mi.UInt32, len(positions) * RAYS)
@@ -92,7 +89,7 @@ def _room(scene: Scene, positions: Vectors, normals: Vectors) -> NDArray[np.floa
     k = lane - point * RAYS
     u = mi.Point2f((mi.Float(k) + 0.5) / RAYS, mi.Float(dr.brev(k)) * 2**-32)  # Hammersley's points
     normal = dr.gather(mi.Vector3f, mi.Vector3f(normals.T), point)
-    start = positions + _offsets(positions)[:, None] * normals
+    start = positions + ray_offsets(positions) * normals
     start = dr.gather(mi.Point3f, mi.Point3f(start.T), point)
     ray = mi.Ray3f(start, mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(u)))
     way = dr.minimum(scene.normalised.ray_intersect_preliminary(ray).t, 1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import hash_rows
 from mi_sparse_prt.measurement.touching_vertices import move_off
+from mi_sparse_prt.scene.ray_offsets import ray_offsets
 from mi_sparse_prt.scene.scene import Scene
 
 
@@ -60,7 +61,7 @@ def _vertex_points(scene: Scene) -> Points:
     inwards = centre - positions[border]  # [border vertex, xyz]
     length = np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-30)
     # into their triangle by four of Mitsuba's ray offsets, or by a quarter of the way to its centre if that is less
-    offset = 4 * float(mi.math.RayEpsilon) * (1 + np.abs(positions[border]).max(axis=1, keepdims=True))
+    offset = 4 * ray_offsets(positions[border])
     moved = positions.copy()
     moved[border] += (inwards * np.minimum(offset / length, 0.25)).astype(np.float32)
     moved = move_off(scene, moved, border)

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
+from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.shape_table import first_triangles
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
 
@@ -235,9 +236,7 @@ class _Looks:
         )
         n = dr.gather(mi.Vector3f, self._backwards, triangle)
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-        return mi.Ray3f(
-            dr.fma(n, (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon, p), mi.Frame3f(n).to_world(local)
-        )
+        return mi.Ray3f(dr.fma(n, ray_offset(p), p), mi.Frame3f(n).to_world(local))
 
 
 def _mean_normals(mesh: TriangleMesh) -> NDArray[np.float32]:

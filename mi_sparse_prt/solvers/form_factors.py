@@ -22,6 +22,7 @@ from mi_sparse_prt.core.sobol import sobol_points
 from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
+from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.shape_table import first_triangles
 
@@ -200,7 +201,7 @@ class Surfaces:
         start = dr.select(of_vertex, dr.gather(mi.Point3f, self._positions, vertex, there), si.p)
         uv = mi.Point2f(rng.next_float32(), rng.next_float32())
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(uv))
-        lifted = dr.fma(normal, (1 + dr.max(dr.abs(start))) * mi.math.RayEpsilon, start)
+        lifted = dr.fma(normal, ray_offset(start), start)
         return mi.Ray3f(lifted, direction)
 
     def corner(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:

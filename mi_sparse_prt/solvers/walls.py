@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.measurement.neighbours import Neighbours
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
 
 PAIRS = 1 << 22  # at a time
@@ -84,7 +85,7 @@ class Walls:
     def _above(self, ids: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f]:
         """Points where rays start, and normals."""
         p, n = self._points.position(ids), mi.Vector3f(self._points.normal(ids))
-        return p + (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon * n, n
+        return p + ray_offset(p) * n, n
 
     def _blocked(self, start: mi.Point3f, end: mi.Point3f) -> mi.Mask:
         ray = mi.Ray3f(start, end - start)
