@@ -128,7 +128,7 @@ def test_other_materials_count_as_diffuse_and_the_error_is_told():
     scene = build(0.5, **shapes)
     ours, exact = (
         prt.precompute(scene, prt.CubemapLighting(4), plan, progress=False)
-        for plan in (Plan("exact", "gather", 1024, 0.01), Plan("exact", "paths", spp=1024))
+        for plan in (Plan("exact", "gather", 1024, 0.01), Plan("exact", "paths", spp=512))
     )
     rows = np.arange(scene.n_vertices)
     true = relative_l2(ours.rows(rows), exact.rows(rows))
