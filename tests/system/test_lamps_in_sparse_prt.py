@@ -169,7 +169,7 @@ def test_direct_light_is_that_of_path(folder, artefact):
     Expected: nothing but noise between `path` and ours.
     """
     scene = load(folder, PLAIN + BULB + BEAM + FAR + SLIDE + SHINY + MIRROR_AND_GLASS, 2)
-    bias, error, distance = beside_path(scene, 2, artefact, 384)
+    bias, error, distance = beside_path(scene, 2, artefact, 768)
     assert error < 0.003
     assert abs(bias) < 4 * error
     assert distance < 0.01
