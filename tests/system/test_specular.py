@@ -220,7 +220,7 @@ def test_bits_and_what_passes_are_told_by_the_same_rays(resolution, depth):
 
 def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
-    scene, lighting = build(0.45, **objects(0.6)), prt.CubemapLighting(4)
+    scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
     problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
     ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
     exact = specular_light(problem, 9, SpecularOptions(6, 6, strata=6)).operator.rows(ids) * power
