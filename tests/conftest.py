@@ -37,6 +37,8 @@ from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reflection.brdf_factors import DirectionGrid, factor_cache
+from mi_sparse_prt.reflection.brdf_factors.factor_cache import FactorOptions
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.problem import Problem, diffuse_problem
@@ -264,6 +266,15 @@ def usual_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 PIPELINE.held_out_error = partial(held_out_error, effort=Effort(spp=64, specular_strata=4))
+
+
+@pytest.fixture
+def usual_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """BRDF factors at as many directions as users have: 16 times the work, of some seconds for each BSDF."""
+    monkeypatch.setattr(factor_cache, "FactorOptions", FactorOptions)
+
+
+factor_cache.FactorOptions = partial(FactorOptions, grid=DirectionGrid(32, 64), pairs=1 << 15)
 
 
 def assert_same(a: LightTransport, b: LightTransport) -> None:

@@ -93,7 +93,7 @@ def test_rough_conductor():
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
-def test_what_narrow_lobes_send_to_a_wall():
+def test_what_narrow_lobes_send_to_a_wall(usual_factors):
     """
     Rationale: pictures show a polished metal by rays that go on; what it throws on a wall is blurred there, and 16
         factors of it are enough.

@@ -22,7 +22,7 @@ from mi_sparse_prt.transport import LightTransport
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 LIGHTING = prt.CubemapLighting(4)
-TERMS, SEEDS = 2, range(48)
+TERMS, SEEDS = 2, range(32)
 EFFORT = Effort(spp=64)  # their noise is taken out, whatever it is
 Doubles = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def rough(colour: bool) -> LightTransport:
 @cache
 def converged(colour: bool) -> tuple[LightTransport, LightTransport]:
     """By brute force, twice, independently."""
-    return tuple(precompute(colour, method="brute_force", spp=256, seed=100 + k) for k in range(2))
+    return tuple(precompute(colour, method="brute_force", spp=128, seed=100 + k) for k in range(2))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def estimates(report: dict) -> dict[str, float]:
 def check(reports: list[dict], true: dict[str, float]) -> None:
     """Without bias: mean squares within three standard errors of their mean, and 2% for what the truth has of its own.
 
-    The spread of 48 seeds is small enough to see a bias of a tenth, but for the ground, which has 81 of the vertices;
+    The spread of 32 seeds is small enough to see a bias of a tenth, but for the ground, which has 81 of the vertices;
     reported intervals hold the truth.
     """
     for name, error in true.items():
@@ -135,7 +135,7 @@ def test_radiance_and_terms(colour):
     """Rationale: elements that no ray of the matrix found tell how far it is off: radiance, squares averaged over views
     by their cosine, and each term by itself.
 
-    A gathered matrix of 16 rays per vertex; the truth is by brute force, twice 256 paths per element. 48 seeds of about
+    A gathered matrix of 16 rays per vertex; the truth is by brute force, twice 128 paths per element. 32 seeds of about
     5500 elements.
 
     Result: total 4.9% (5.1% grey), terms 4.6% and 4.1%; estimates spread by 3%.

@@ -115,7 +115,7 @@ def test_light_is_right_in_sum(scene, transport):
         glossy = references.regions(sensor, 16, 1)["glossy"]
         ratios = []
         for seed in range(4):
-            images = references.rendered(sensor, 1024, (7, seed), ["directions"])
+            images = references.rendered(sensor, 512, (7, seed), ["directions"])
             ours, theirs = (
                 np.sum([half[glossy].sum() for half in images[k]]) for k in ("ours", "directions")
             )

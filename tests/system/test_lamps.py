@@ -54,7 +54,7 @@ def room(lit: tuple[str, ...] = ("lamp", "bulb", "beam", "sky")) -> mi.Scene:
         "type": "perspective",
         "fov": 40,
         "to_world": T().look_at([0, 0, 3.5], [0, 0, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 48, "height": 48},
+        "film": {"type": "hdrfilm", "width": 32, "height": 32},
     }
     return mi.load_dict(
         {

@@ -155,7 +155,7 @@ def test_a_room_with_all_kinds_of_light(folder, artefact):
     Expected: the mean of `path` within 1%, and an error of few per cent, that of interpolation of the sky's light
     between vertices 0.12 apart.
     """
-    bias, error, distance = beside_path(load(folder, PLAIN + BULB + SKY), 4, artefact)
+    bias, error, distance = beside_path(load(folder, PLAIN + BULB + SKY), 4, artefact, 128)
     assert error < 0.003
     assert abs(bias) < 0.01
     assert distance < 0.03

@@ -66,7 +66,7 @@ def scene_of(camera: dict | None = None, **more: object) -> mi.Scene:
 def integrator(tmp_path_factory: pytest.TempPathFactory) -> dict:
     """Parameters of ours; all tests share a cache."""
     cache = str(tmp_path_factory.mktemp("modes"))
-    return {"type": "sparse_prt", "resolution": 8, "max_depth": 4, "edge_length": 0.15} | {
+    return {"type": "sparse_prt", "resolution": 8, "max_depth": 4, "edge_length": 0.2} | {
         "method": "gather",
         "progress": False,
         "cache": cache,

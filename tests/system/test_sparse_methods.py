@@ -217,12 +217,12 @@ def test_sparse_is_better_for_less():
 
 
 def test_indirect_light_of_sparse():
-    """Against brute force at 64 paths, under even light, over 4 seeds.
+    """Against brute force at 24 paths, under even light, over 4 seeds.
 
     Expected: the mean per vertex within 15%, which is what interpolation costs; the sum within the 2% that 4 x 4 texels
     per face may miss of it, and three standard errors of these seeds, which are small enough to see 5%.
     """
-    true = precompute(scene(), "brute_force", 4, spp=64).indirect
+    true = precompute(scene(), "brute_force", 4, spp=24).indirect
     even = np.ones((N, 3), np.float32)
     expected, found = true.relight(even), []
     for seed in range(4):

@@ -48,14 +48,14 @@ def row_sample(weights: np.ndarray, squares: np.ndarray, norms: np.ndarray) -> S
 
 @cache
 def converged(scene: prt.Scene, basis: str) -> list[np.ndarray]:
-    """The whole matrix twice, independently, at 128 samples per element."""
+    """The whole matrix twice, independently, at 64 samples per element."""
     return [
         prt.precompute(
             scene,
             LIGHTING,
             method="brute_force",
             basis=basis,
-            spp=128,
+            spp=64,
             strata=6,
             seed=1000 + k,
             progress=False,

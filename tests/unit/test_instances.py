@@ -80,7 +80,7 @@ def bricks(count: int) -> dict:
 
 
 def test_instances_become_one_mesh_for_each_bsdf() -> None:
-    original = mi.load_dict(bricks(30))
+    original = mi.load_dict(bricks(15))
     scene = Scene.from_mitsuba(original, 0.2)
     assert [mesh.name for mesh in scene.fronts] == ["ground", "kind0_body", "kind1_body"]
     assert all(shape.is_mesh() for shape in (*scene.mitsuba.shapes(), *scene.normalised.shapes()))
@@ -136,13 +136,13 @@ def test_instances_do_not_stay_in_memory() -> None:
         dr.eval(scene.normalised.ray_intersect(ray))
         return time.perf_counter() - begun
 
-    original = mi.load_dict(bricks(80))
+    original = mi.load_dict(bricks(50))
     scene = Scene.from_mitsuba(original, 1.0)
     with_instances = min(seconds_to_trace() for _ in range(2))
     del original
     gc.collect()
     without = min(seconds_to_trace() for _ in range(3))
-    print(f"{with_instances:.3f} s with 80 instances, {without:.4f} s without")
+    print(f"{with_instances:.3f} s with 50 instances, {without:.4f} s without")
     assert without < with_instances / 10
 
 

@@ -79,7 +79,7 @@ def test_the_error_of_many_meshes(scene):
         scene, LIGHTING, Plan("consensus", "gather", 16, 0.2), max_depth=3, progress=False
     )
     truth = [
-        prt.precompute(scene, LIGHTING, "brute_force", max_depth=3, spp=128, seed=50 + k, progress=False)
+        prt.precompute(scene, LIGHTING, "brute_force", max_depth=3, spp=16, seed=50 + k, progress=False)
         .rows(np.arange(scene.n_vertices))
         .astype(np.float64)
         for k in (0, 1)
