@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bit_of, pack
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.emission.cube_faces import cube_points, face_places, texels_beside
 
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
@@ -110,6 +111,7 @@ class TexelSides:
         """
         result = np.zeros((len(seen), -(-len(self.paths) // BITS)), np.uint32)
         first, second = self.tables.first[self._outer], self.tables.second[self._outer]
+        seen, known = read_only(seen), read_only(known)
         _mark_differing(seen, known, self._right, self._below, self._resolution, first, second, result)
         return result
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.transport import LightTransport
@@ -187,7 +188,7 @@ def _by_cosine(
     for a in range(0, n, BLOCK):
         block = slice(a, min(a + BLOCK, n))
         texels, weights, counts = _kept(
-            normals[block], directions, areas, floor, bits[block], around, trials, seeds[block]
+            normals[block], directions, areas, floor, read_only(bits[block]), around, trials, seeds[block]
         )
         vertices = np.repeat(np.arange(first + a, first + block.stop), counts)
         parts.append((vertices, *_packed(texels, weights, counts)))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_overlapped
 
 Ids = NDArray[np.integer]
@@ -296,13 +297,6 @@ class Masked(Operator):
         result, some = np.ones(len(rows), np.bool_), np.isin(rows, self.points)
         result[some] = bits_at(self.open, np.searchsorted(self.points, rows[some]), texels[some])
         return result
-
-
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """A view that cannot be written to."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:

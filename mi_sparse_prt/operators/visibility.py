@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.operators.operator import Floats, Ids, Operator, read_only
+from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 #: Bits of texels; where those that are seen in part begin in two lists; these texels, and their shares.
 SeenTexels = tuple[Bits, NDArray[np.int64], NDArray[np.unsignedinteger], NDArray[np.uint8]]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, count_bits, list_bits, lowest_bit
 from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.emission.texel_adjacency import Sides, TexelSides
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -118,7 +119,8 @@ def _cut_texels(
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)
     number = np.empty(len(bits), np.int64)
     threads = numba.get_num_threads()
-    _find_shares(sides.tables, bits, above, horizon, crossings, threads, room, seen, entries, number)
+    known = read_only(bits)
+    _find_shares(sides.tables, known, above, horizon, crossings, threads, room, seen, entries, number)
     starts = row_starts(number)
     kind = np.result_type(
         np.uint16, np.min_scalar_type(m - 1)

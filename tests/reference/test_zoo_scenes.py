@@ -23,22 +23,7 @@ def mean(pair: Pair) -> np.ndarray:
     return np.mean(pair, axis=0)
 
 
-# these are elsewhere in the quick run: rectangles, cubes, and a constant sky in most tests, meshes from files in
-# shape_obj, checkers in test_specular.py, textures of texels in texture_bitmap
-COVERED = (
-    "bsdf_diffuse",
-    "emitter_constant",
-    "shape_cube",
-    "shape_rectangle",
-    "shape_serialized",
-    "texture_bitmap_nearest",
-    "texture_checkerboard",
-)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in COVERED else n for n in SCENES]
-)
+@pytest.mark.parametrize("name", SCENES)
 def test_scenes_agree(name, artefact):
     """Rationale: what a user of Mitsuba gets is one number per pixel; here it is compared for whole scenes.
 
