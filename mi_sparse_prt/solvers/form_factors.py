@@ -7,7 +7,7 @@ tile is a millimetre before it. There a ray goes on, by chance as the surface re
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -85,6 +85,29 @@ def gather_matrix(
     return scipy.sparse.csr_array(entries, shape=(len(starting), scene.n_vertices))
 
 
+class Traced(NamedTuple):
+    """What rays met, on the device.
+
+    Attributes
+    ----------
+    vertex : UInt32
+        The vertex whose light each finds, or NOTHING.
+    ray : Ray3f
+    point : UInt32
+        Where it started.
+    gaps : UInt32
+        Rays that ended in narrow gaps.
+    last : Vector3f
+        The directions of these when they met their vertices.
+    """
+
+    vertex: Any
+    ray: Any
+    point: Any
+    gaps: Any
+    last: Any
+
+
 class Surfaces:
     """The triangles of a scene on the device, by the numbers of all vertices (``n_vertices``).
 
@@ -113,20 +136,27 @@ class Surfaces:
         self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
     ) -> NDArray[np.int32]:
         """A vertex or NOTHING for every sample of each point; samples side by side."""
-        ray, _, u, rng = cosine_rays(points, ids, samples, seed)
-        return mi.Int32(self.traced(ray, u, rng)[0]).numpy()
+        return mi.Int32(self.traced(points, ids, samples, seed).vertex).numpy()
 
-    def traced(self, ray: mi.Ray3f, u: mi.Float, rng: mi.PCG32) -> tuple[mi.UInt32, mi.Vector3f]:
-        """A vertex or NOTHING for every ray, and the direction in which it is met.
+    def traced(self, points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int) -> Traced:
+        """What cosine-distributed rays from points meet, samples side by side."""
+        ray, point, vertex, narrow, *_ = self._met(cosine_rays(points, ids, samples, seed))
+        dr.eval(vertex, narrow)
+        lanes = dr.compress(narrow)  # few, and the ways out of gaps are long: these go together
+        last = mi.Vector3f()
+        if len(lanes):
+            some, _, inside, _, hit, rng = self._met(cosine_rays(points, ids, samples, seed, lanes))
+            inside, last = self._out_of_gap(some, hit, inside, rng)
+            dr.scatter(vertex, inside, lanes)
+            dr.eval(vertex, last)
+        return Traced(vertex, ray, point, lanes, last)
 
-        u in [0, 1) chooses among the corners of a triangle; the generator's numbers lead out of gaps.
-        """
+    def _met(self, rays: tuple[mi.Ray3f, mi.UInt32, mi.Float, mi.PCG32]) -> tuple[Any, ...]:
+        """Rays, their points, the vertices that they meet, and whether in a narrow gap; where, and random numbers."""
+        ray, point, u, rng = rays
         hit = self._scene.ray_intersect_preliminary(ray)
         vertex = self.corner(hit, ray, u)
-        narrow = self._is_narrow(hit, ray, vertex)
-        return dr.if_stmt(  # few rays end in gaps
-            (ray, hit, vertex, rng), narrow, self._out_of_gap, lambda ray, hit, vertex, rng: (vertex, ray.d)
-        )
+        return ray, point, vertex, self._is_narrow(hit, ray, vertex), hit, rng
 
     def _is_narrow(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, vertex: mi.UInt32) -> mi.Mask:
         return (vertex != NOTHING) & (hit.t < NARROW * self._way(hit, ray, vertex))
@@ -234,14 +264,14 @@ class Surfaces:
 
 
 def cosine_rays(
-    points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int
+    points: PointArrays, ids: mi.UInt32, samples: list[mi.UInt32], seed: int, lanes: mi.UInt32 | None = None
 ) -> tuple[mi.Ray3f, mi.UInt32, mi.Float, mi.PCG32]:
-    """Cosine-distributed rays from points, samples side by side.
+    """Cosine-distributed rays from points, samples side by side; or those of some lanes.
 
     With each one's point, a number in [0, 1) for it, and more random numbers.
     """
     rays = len(samples[0])
-    lane = dr.arange(mi.UInt32, len(ids) * rays)
+    lane = dr.arange(mi.UInt32, len(ids) * rays) if lanes is None else lanes
     row = lane // rays
     point, sample = dr.gather(mi.UInt32, ids, row), lane - row * rays
     rng = random_generator(points.key(point), mi.UInt32(0), mi.UInt32(0), seed)

@@ -31,7 +31,7 @@ from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.solvers.first_bounce import USUAL
-from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, sobol
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import (
@@ -187,11 +187,12 @@ def gather_rays(
     blocks = []
     for a in range(0, len(points), size):
         some = points[a : a + size]
-        ray, point, u, rng = cosine_rays(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
-        vertex, last = surfaces.traced(ray, u, rng)
-        dr.eval(vertex, last, ray.d, point)
+        found = surfaces.traced(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
+        vertex, point, first, last = found.vertex, found.point, found.ray.d, mi.Vector3f(found.ray.d)
+        dr.eval(point, first, last)
+        dr.scatter(last, found.last, found.gaps)
         met = dr.compress(vertex < NOTHING)
-        point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, ray.d, last))
+        point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, first, last))
         row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
         blocks.append((
             np.bincount(row, minlength=len(some)),
