@@ -28,6 +28,11 @@ from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, Specular
 SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
 ROUNDS = 3  # after the first
+# of the rays that seem to be asked for: few first ones do not tell how much rays gain that go where light comes from
+CAUTION = 0.5
+ENOUGH = (
+    1.25  # times the squared noise that is wanted, after a round: another one has a ray in each cell at least
+)
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 SUMS = 1 << 24  # elements at a time in which light is added up: 64 MB for each channel
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
@@ -43,7 +48,8 @@ class SpecularOptions:
     Attributes
     ----------
     first : int
-        Strata per axis of a cell of the hemisphere, each with a ray, in each of two independent halves.
+        Strata per axis of a cell of the hemisphere, each with a ray, in each of two independent halves; fewer where
+        what is seen sends on a small share of light, unless as many as ``last``.
     last : int
         At most; cells from which more light arrives have more, until the noise is small enough.
     error : float
@@ -171,17 +177,23 @@ class _Arriving:
         self._cells = self._chains.find_cells(ids, next(self._seeds))
 
     def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
-        """As many strata as the noise asks for; the first ones, as many in each cell, say where light comes from."""
-        strata = np.full(len(self._cells.rows), options.first)
-        first, squares = self._sampled(strata)
-        first = first._replace(rays=len(self._ids) * CELLS**2 + first.rays)
+        """As many strata as the noise asks for; the first ones say where light comes from.
+
+        Rays are best in proportion to what they spread by; first, that is the share of light that surfaces send on.
+        """
+        found = len(self._ids) * CELLS**2
         if options.first >= options.last:
-            return first
-        n = 2 * options.first**2
+            only, _ = self._sampled(np.full(len(self._cells.rows), options.first))
+            return only._replace(rays=found + only.rays)
+        across = np.rint(options.first * np.sqrt(self._cells.shares))
+        strata = np.clip(across, 1, options.first).astype(np.int64)
+        first, squares = self._sampled(strata)
+        first = first._replace(rays=found + first.rays)
+        n = 2 * strata**2
         # moments of weights, as if there were one average ray more; numbers of rays are proportional to their roots
-        second = (squares + squares.mean() / n) / (n + 1)
+        second = (squares + squares.sum() / max(n.sum(), 1)) / (n + 1)
         best = np.sqrt(second * self._power.max(axis=1)[self._cells.rows])
-        noise_of_one = first.noise * (n / 2) * best.sum() / max((best**2).sum(), 1e-300)
+        noise_of_one = first.noise * best.sum() / max((best**2 / strata**2).sum(), 1e-300)
 
         def sample(wanted: float) -> tuple[_Estimate, bool]:
             across = np.rint(np.sqrt(best * (noise_of_one / wanted)))
@@ -341,9 +353,9 @@ def _until_good(
     total, trust, finest = first, 1.0, False
     for _ in range(ROUNDS):
         bound = limit.of(total.square)
-        if total.noise <= bound or finest:
+        if total.noise <= (bound if total is first else ENOUGH * bound) or finest:
             break
-        wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / total.noise)
+        wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / total.noise) / CAUTION
         found, finest = sample(wanted * trust)
         trust *= min(wanted / max(found.noise, 1e-300), 1)
         total = _mean_of(total, found)

@@ -28,6 +28,7 @@ from mi_sparse_prt.solvers.problem import Problem
 LANES = 1 << 22  # rays per wavefront
 FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
 CELLS = 16  # of a hemisphere, per axis
+LEAST = 1e-6  # share of light that a specular surface is taken to send on
 LONGEST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 
 Sparse: TypeAlias = scipy.sparse.csr_array
@@ -42,14 +43,17 @@ class Cells(NamedTuple):
         Which of the points, ascending.
     numbers : (m,) int64
         Of a cell of its hemisphere.
+    shares : (m,) float32
+        Of light, that specular surfaces in or next to it send on: the largest, by one ray into each cell.
     """
 
     rows: NDArray[np.int64]
     numbers: NDArray[np.int64]
+    shares: NDArray[np.float32]
 
     def take(self, part: slice) -> Cells:
         """Some of them."""
-        return Cells(self.rows[part], self.numbers[part])
+        return Cells(self.rows[part], self.numbers[part], self.shares[part])
 
 
 class SkyLight(NamedTuple):
@@ -99,12 +103,13 @@ class SpecularChains:
         found = []
         for a in range(0, len(ids), LANES // CELLS**2):
             some = ids[a : a + LANES // CELLS**2]
-            cells = Cells(*(x.ravel() for x in np.indices((len(some), CELLS**2))))
-            ray, _, _ = self._rays_into(some, cells, np.ones(len(cells.rows), np.int64), seed)
-            seen = self._specular_hits(ray)[1].numpy().reshape(-1, CELLS, CELLS)
-            grown = scipy.ndimage.maximum_filter(seen, (1, 3, 3))
-            row, number = np.nonzero(grown.reshape(len(some), -1))
-            found.append((a + row, number))
+            row, number = (x.ravel() for x in np.indices((len(some), CELLS**2)))
+            every = Cells(row, number, np.zeros(len(row), np.float32))
+            ray, _, rng = self._rays_into(some, every, np.ones(len(row), np.int64), seed)
+            shares = self._shares(ray, rng).reshape(-1, CELLS, CELLS)
+            grown = scipy.ndimage.maximum_filter(shares, (1, 3, 3)).reshape(len(some), -1)
+            row, number = np.nonzero(grown)
+            found.append((a + row, number, grown[row, number]))
         return Cells(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
     def gather_sky(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> SkyLight:
@@ -187,6 +192,19 @@ class SpecularChains:
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
         direction = mi.Frame3f(self._points.normal(point)).to_world(local)
         return start_ray(self._points, point, direction), entry, rng
+
+    def _shares(self, ray: mi.Ray3f, rng: mi.PCG32) -> NDArray[np.float32]:
+        """Of light, that what each ray meets sends on; 0 if that is no specular surface."""
+        hit, met = self._specular_hits(ray)
+        dr.eval(hit, met, ray, rng)
+        shares, index = dr.zeros(mi.Float, dr.width(met)), dr.compress(met)
+        if len(index):
+            ray, rng, hit = (dr.gather(type(x), x, index) for x in (ray, rng, hit))
+            si = hit.compute_surface_interaction(ray)
+            _, share = self._scattered(si, rng, mi.Mask(True))
+            dr.scatter(shares, dr.maximum(dr.max(share), LEAST), index)
+        found: NDArray[np.float32] = shares.numpy()
+        return found
 
     def _specular_hits(self, ray: mi.Ray3f) -> tuple[mi.PreliminaryIntersection3f, mi.Mask]:
         """What rays meet, and whether they go on from there."""
