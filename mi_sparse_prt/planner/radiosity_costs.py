@@ -231,7 +231,8 @@ class _Pilot:
 
     def rays(self, count: int, seed: int) -> scipy.sparse.csr_array:
         """Rows of G."""
-        return gather_matrix(self._scene, self._direct.points, count, seed, self._vertices)
+        depth = self._direct.problem.max_depth
+        return gather_matrix(self._scene, self._direct.points, count, seed, self._vertices, depth)
 
     def light(self, rays: scipy.sparse.csr_array, texels: NDArray[np.integer]) -> NDArray[np.float64]:
         """The first bounce (k, t, channels) of unit-albedo transport at t texels (k, t) of each vertex."""

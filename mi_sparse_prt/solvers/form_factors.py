@@ -34,7 +34,9 @@ NOTHING = int(
 # had the least error in a kitchen with gaps of 1 mm (indirect light 3.0, 2.8, 2.7 and 3.6% off, 4.5% by interpolation).
 NARROW = 0.25
 TRIES = 8  # to find an open corner of a triangle, of three
-MOST_IN_GAP = 64  # surfaces, where ``max_depth`` sets no limit: white ones keep light for long
+MOST_IN_GAP = (
+    64  # surfaces, where ``max_depth`` sets no limit: a ray that white ones keep for longer ends as any other
+)
 
 
 def gather_matrix(
@@ -130,6 +132,7 @@ class Surfaces:
         self._positions = mi.Point3f(vertex_points(scene).positions.T)
         self._albedo = mi.Float(scene.albedo.mean(axis=1))
         self._most = MOST_IN_GAP if max_depth < 0 else min(max(max_depth - 3, 0), MOST_IN_GAP)
+        self._endless = max_depth < 0
         dr.eval(self._positions, self._albedo)
 
     def seen_from(
@@ -190,22 +193,16 @@ class Surfaces:
             blocked = inside & found.is_valid() & (found.t < self._way(hit, ray, vertex))
             again = blocked & is_open & (met < TRIES)
             albedo = dr.gather(mi.Float, self._albedo, vertex, blocked)
-            reflected = blocked & ~is_open & (rng.next_float32() < albedo) & (met < most)
+            lit = blocked & ~is_open & (rng.next_float32() < albedo)
+            reflected = lit & (met < most)
             ray, hit = dr.select(reflected, onward, ray), dr.select(reflected, found, hit)
-            absorbed = blocked & ~is_open & ~reflected
+            absorbed = blocked & ~is_open & ~(lit if self._endless else reflected)
             vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32()), vertex)
             vertex = dr.select(absorbed, NOTHING, vertex)
             opened = inside & ~blocked & ~is_open
-            inside = again | opened | (reflected & self._is_narrow(hit, ray, vertex))
-            return (
-                ray,
-                hit,
-                vertex,
-                rng,
-                inside & (vertex != NOTHING),
-                is_open | opened,
-                dr.select(opened, 0, met + 1),
-            )
+            goes_on = again | opened | (reflected & self._is_narrow(hit, ray, vertex))
+            met = dr.select(opened, 0, met + 1)
+            return ray, hit, vertex, rng, goes_on & (vertex != NOTHING), is_open | opened, met
 
         state = ray, hit, vertex, rng, mi.Mask(True), mi.Mask(False), mi.UInt32(0)
         ray, _, vertex, *_ = dr.while_loop(state, lambda *state: state[4], go_on)

@@ -28,10 +28,11 @@ from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, Specular
 SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
 ROUNDS = 3  # after the first
-# of the rays that seem to be asked for: few first ones do not tell how much rays gain that go where light comes from
-CAUTION = 0.5
+CAUTION = (
+    0.5  # of the rays that seem to be asked for: the first ones know little of what better placed ones gain
+)
 ENOUGH = (
-    1.25  # times the squared noise that is wanted, after a round: another one has a ray in each cell at least
+    1.25  # times the squared noise that is wanted, after a round: another has a ray in each cell at least
 )
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 SUMS = 1 << 24  # elements at a time in which light is added up: 64 MB for each channel
