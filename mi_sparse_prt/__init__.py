@@ -19,6 +19,8 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.measurement.pixels import camera_pixels
     from mi_sparse_prt.precompute import precompute, precompute_glossy
     from mi_sparse_prt.relighting.image import render
+    from mi_sparse_prt.relighting.light import TurningLight
+    from mi_sparse_prt.relighting.relighter import Relighter
     from mi_sparse_prt.scene.loading import load_scene
     from mi_sparse_prt.scene.scene import Scene
     from mi_sparse_prt.storage import load_transport
@@ -32,8 +34,10 @@ _MODULES = {
     "Environment": "emission.environment",
     "GlossyTransport": "transport",
     "LightTransport": "transport",
+    "Relighter": "relighting.relighter",
     "Scene": "scene.scene",
     "SceneEmitters": "emission.emitters",
+    "TurningLight": "relighting.light",
     "Validation": "validation.validate",
     "camera_pixels": "measurement.pixels",
     "compress": "compression.compress",
@@ -54,8 +58,10 @@ __all__ = [
     "LightTransport",
     "PrtError",
     "PrtWarning",
+    "Relighter",
     "Scene",
     "SceneEmitters",
+    "TurningLight",
     "Validation",
     "camera_pixels",
     "compress",

@@ -221,7 +221,10 @@ class LightTransport:
         (n, 3) float32
             Radiance towards ``outgoing``; without it radiosity / pi, which is the radiance of a diffuse point.
         """
-        incident = self._incident_light(lighting)
+        return self.leaving(self._incident_light(lighting), outgoing)
+
+    def leaving(self, incident: Floats, outgoing: ArrayLike | None = None) -> Floats:
+        """What leaves points whose incident light (rows, 3) is known; ``outgoing`` and result as of ``relight``."""
         if outgoing is None or not isinstance(self.reflection, InOutFactors):
             return self.measurement.combined(self.reflection.radiosity(incident))
         towards = np.broadcast_to(np.asarray(outgoing, np.float32), self.reflection.normals.shape)

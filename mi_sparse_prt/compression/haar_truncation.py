@@ -21,6 +21,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar
 from mi_sparse_prt.measurement.measurement import MeshRange
 from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.transport import LightTransport
 
 TARGET = 0.05  # relative error of a row, if not given
@@ -133,6 +134,16 @@ def haar_mesh(transport: LightTransport, mesh: MeshRange, target_error: float, b
         sums += _sums(rows, part, energies, sphere.weights[ids], transport.albedo[mesh.vertices][ids])
         bar.update(len(ids))
     return HaarMesh(_joined(blocks), *sums.tolist())
+
+
+def haar_lists(
+    operator: Operator, ids: Indices, lighting: CubemapLighting, target_error: float = TARGET
+) -> HaarRows:
+    """Some rows of any linear factor of T as lists of wavelet coefficients; errors are those of ``haar_part``."""
+    rows = np.moveaxis(operator.rows(ids), 2, 1) / np.sqrt(lighting.solid_angles)
+    coefficients = haar(np.ascontiguousarray(rows, np.float32))
+    truncate(coefficients, max(target_error**2 - ROUNDING, 0))
+    return _stored(coefficients, lighting)
 
 
 def truncate(coefficients: Floats, share: float) -> Doubles:

@@ -14,6 +14,7 @@ coefficients of a face are the transform of a face of 2^l x 2^l texels.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pywt
 from numpy.typing import NDArray
@@ -45,6 +46,45 @@ def inverse_haar(coefficients: Floats) -> Floats:
         result[..., :size, :size] = pywt.idwt2((result[..., :half, :half], details), "haar", "periodization")
         half = size
     return result.reshape(coefficients.shape)
+
+
+def haar_bands(n: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Band and side of each coefficient of 6 x n x n texels, (6 n^2,) both.
+
+    Bands go from 0, squares as large as a face, to log2(n) - 1; a face's mean is in the first. Sides are in texels.
+    """
+    row, column = np.unravel_index(np.arange(6 * n * n), (6, n, n))[1:]
+    level = np.frexp(np.maximum(np.maximum(row, column), 1))[1].astype(np.int64) - 1
+    return level, (n / 2.0**level).astype(np.float32)
+
+
+def haar_colours(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``haar`` of each column of (6 n^2, 3), in compiled code: for light that changes in every frame."""
+    n = round((len(values) / 6) ** 0.5)
+    faces = np.array(values, np.float32).reshape(6, n, n, 3)
+    _transform(faces)
+    return faces.reshape(-1, 3)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _transform(faces: NDArray[np.float32]) -> None:
+    """Faces (6, n, n, 3) in place."""
+    n, half_of = faces.shape[1], np.float32(0.5)
+    for f in numba.prange(6):
+        room, size = np.empty((n, n, 3), np.float32), n
+        while size > 1:
+            half = size // 2
+            for i in range(half):
+                for j in range(half):
+                    for c in range(3):
+                        a, b = faces[f, 2 * i, 2 * j, c], faces[f, 2 * i, 2 * j + 1, c]
+                        d, e = faces[f, 2 * i + 1, 2 * j, c], faces[f, 2 * i + 1, 2 * j + 1, c]
+                        room[i, j, c] = half_of * ((a + b) + (d + e))
+                        room[i, half + j, c] = half_of * ((a - b) + (d - e))
+                        room[half + i, j, c] = half_of * ((a + b) - (d + e))
+                        room[half + i, half + j, c] = half_of * ((a - b) - (d - e))
+            faces[f, :size, :size] = room[:size, :size]
+            size = half
 
 
 def _faces(values: Floats) -> Floats:

@@ -109,7 +109,7 @@ class HaarRows(Operator):
 
 
 @numba.njit(inline="always")
-def _number(half: int) -> np.float32:
+def half_float(half: int) -> np.float32:
     """A float16 from its 16 bits: where float32 has them they mean 2^-112 of it, as exponents count from elsewhere."""
     bits = np.uint32(((half & 0x8000) << 16) | ((half & 0x7FFF) << 13))
     return bits.view(np.float32) * np.float32(2.0**112)
@@ -133,7 +133,7 @@ def _times_three(
             own_places, own_halves = places[first:last], halves[first:last]
             red, green, blue = np.float32(0), np.float32(0), np.float32(0)
             for e in range(len(own_places)):
-                value, j = _number(own_halves[e]), own_places[e]
+                value, j = half_float(own_halves[e]), own_places[e]
                 red += value * light[j, 0]
                 green += value * light[j, 1]
                 blue += value * light[j, 2]
@@ -160,7 +160,7 @@ def _times(
             first, last = starts[i * channels + c], starts[i * channels + c + 1]
             own_places, own_halves = places[first:last], halves[first:last]
             for e in range(len(own_places)):
-                value, j = _number(own_halves[e]) * scales[i, c], own_places[e]
+                value, j = half_float(own_halves[e]) * scales[i, c], own_places[e]
                 for q in range(k):
                     sums[q] += value * light[j, q]
     return result

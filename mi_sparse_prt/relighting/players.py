@@ -1,0 +1,307 @@
+"""What applies an update of the light to T: incident light of all rows, from one frame to the next.
+
+========================  ======================================  ==================================================
+``ColumnsPlayer``         lists of wavelet coefficients           adds columns ([OBRG06] Figure 6)
+``ClusteredPlayer``       clustered PCA                           both of its steps go on from before (6.3)
+``ProductPlayer``         any other matrix: bits, A D, low rank   the whole product T L~ in every frame
+========================  ======================================  ==================================================
+
+Sums over thousands of frames do not drift: what wavelets are added to has 64 bits, and of clustered PCA some clusters
+are summed anew in every frame.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.haar import haar, inverse_haar
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.operators.haar_rows import HaarRows
+from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.relighting.approximations import Update
+from mi_sparse_prt.relighting.columns import WaveletColumns, add_columns, wavelet_columns
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+REFRESH = 128  # frames within which all clusters are summed anew
+COEFFICIENTS = 512  # of clusters, that a thread works on at a time: they stay in its cache
+
+
+class Player(ABC):
+    """Sums of T L~ that follow L~.
+
+    Attributes
+    ----------
+    incident : (rows, 3) float32
+        T L~: unit-albedo light of points, then of terms. Overwritten by the next frame.
+    prepared_bytes : int
+        What it keeps in memory beside the matrix: a converted matrix, and sums.
+    """
+
+    name: ClassVar[str]
+    incident: Floats
+
+    @abstractmethod
+    def reset(self) -> None:
+        """No light."""
+
+    @abstractmethod
+    def apply(self, update: Update) -> None:
+        """Bring ``incident`` up to date."""
+
+    @abstractmethod
+    def column_norms(self) -> Floats | None:
+        """(m,) how much wavelets do to all rows together; None if that would take the whole matrix."""
+
+    @property
+    @abstractmethod
+    def prepared_bytes(self) -> int: ...
+
+
+def player(
+    operator: Operator, lighting: CubemapLighting, groups: int = 1, vectors: int | None = None
+) -> Player:
+    """What plays a linear factor of T best.
+
+    Parameters
+    ----------
+    operator : Operator
+    lighting : CubemapLighting
+    groups : int
+        Of coefficients that are reset apart from each other (``Approximation.groups``).
+    vectors : int, optional
+        Basis vectors of each cluster whose weights are applied in a frame; all if not given.
+    """
+    if isinstance(operator, Clustered):
+        return ClusteredPlayer(operator, groups, vectors)
+    if isinstance(operator, HaarRows):
+        return ColumnsPlayer(wavelet_columns(operator, lighting), groups)
+    return ProductPlayer(operator, lighting)
+
+
+class ProductPlayer(Player):
+    """The whole product in every frame: as dear as relighting, and exact for any matrix."""
+
+    name = "product"
+
+    def __init__(self, operator: Operator, lighting: CubemapLighting) -> None:
+        self._operator, self._lighting = operator, lighting
+        self.reset()
+
+    def reset(self) -> None:
+        self.incident = np.zeros((self._operator.shape[0], 3), np.float32)
+
+    def apply(self, update: Update) -> None:
+        texels = inverse_haar(update.applied.T).T / np.sqrt(self._lighting.solid_angles)[:, None]
+        self.incident = self._operator.relight(np.ascontiguousarray(texels, np.float32))
+
+    def column_norms(self) -> Floats | None:
+        return None
+
+    @property
+    def prepared_bytes(self) -> int:
+        return self.incident.nbytes
+
+
+class ColumnsPlayer(Player):
+    """Columns of wavelets, added to an image for each group of coefficients that may be reset ([OBRG06] Figure 6).
+
+    The sum of these images changes with them, so that a frame without resets costs no more than it adds.
+    """
+
+    name = "columns"
+
+    def __init__(self, columns: WaveletColumns, groups: int = 1) -> None:
+        self.columns, self._groups = columns, groups
+        self.reset()
+
+    def reset(self) -> None:
+        rows = len(self.columns.scales)
+        self._total = np.zeros((rows, 3))
+        self._sums = np.zeros((self._groups, rows if self._groups > 1 else 0, 3))
+        self.incident = np.zeros((rows, 3), np.float32)
+
+    def apply(self, update: Update) -> None:
+        columns = self.columns
+        halves = columns.values.view(np.uint16)
+        parts = update.coefficients, update.changes, update.starts, update.resets
+        add_columns(
+            columns.starts,
+            columns.places,
+            halves,
+            columns.scales.shape[1],
+            parts,
+            self._sums,
+            self._total,
+        )
+        np.multiply(self._total, columns.scales, out=self.incident, casting="same_kind")
+
+    def column_norms(self) -> Floats | None:
+        return self.columns.norms()
+
+    @property
+    def prepared_bytes(self) -> int:
+        return self.columns.nbytes + self._total.nbytes + self._sums.nbytes + self.incident.nbytes
+
+
+class ClusteredPlayer(Player):
+    """Clustered PCA: wavelets change coefficients of clusters, and these the light of rows ([OBRG06] 6.3).
+
+    Parameters
+    ----------
+    operator : Clustered
+    groups : int
+    vectors : int, optional
+        Basis vectors of each cluster that are applied in a frame: those whose coefficients changed most, times the norm
+        of their weights. What is left out is applied later. All if not given, and in the first frame.
+    """
+
+    name = "clustered"
+
+    def __init__(self, operator: Clustered, groups: int = 1, vectors: int | None = None) -> None:
+        self._groups = groups
+        clusters, count, m = operator.bases.shape
+        self._count = count + 1  # with the mean
+        self.vectors = count if vectors is None else vectors
+        self._columns = np.empty((m, clusters * self._count), np.float32)
+        for c in range(clusters):
+            affine = np.concatenate([operator.means[c][None], operator.bases[c]]).astype(np.float32)
+            self._columns[:, c * self._count : (c + 1) * self._count] = haar(affine).T
+        self._order = np.argsort(operator.labels, kind="stable").astype(np.int64)
+        self._starts = np.searchsorted(operator.labels[self._order], np.arange(clusters + 1))
+        # [channel, vector, row], rows by cluster: weights of a vector are read as runs
+        self._weights = np.ascontiguousarray(
+            np.moveaxis(operator.coefficients[self._order], 0, 2).astype(np.float32)
+        )
+        self._norms = np.stack(
+            [
+                np.sqrt(np.square(self._weights[:, :, a:b]).sum(axis=(0, 2)))
+                for a, b in zip(self._starts[:-1], self._starts[1:], strict=True)
+            ]
+        ).astype(np.float64)
+        self.reset()
+
+    def reset(self) -> None:
+        values, rows = self._columns.shape[1], len(self._order)
+        self._sums = np.zeros((self._groups, 3, values))
+        self._done = np.zeros((3, values))  # coefficients of clusters that rows show
+        self._rows = np.zeros((3, rows), np.float32)  # by cluster
+        self.incident = np.zeros((rows, 3), np.float32)
+        self._frame = 0
+
+    def apply(self, update: Update) -> None:
+        parts = update.coefficients, update.changes, update.starts, update.resets
+        coefficients = _add_to_clusters(self._columns, parts, self._sums)
+        vectors = self.vectors if self._frame else self._count - 1  # the first frame is exact
+        _add_to_rows(
+            (coefficients, self._done, self._norms),
+            (self._weights, self._starts, self._order),
+            (vectors, self._frame % REFRESH),
+            self._rows,
+            self.incident,
+        )
+        self._frame += 1
+
+    def column_norms(self) -> Floats | None:
+        """From the clusters' Gram matrices of weights: the norms of what a coefficient adds to their rows."""
+        squares = np.zeros(len(self._columns))
+        for c, (a, b) in enumerate(zip(self._starts[:-1], self._starts[1:], strict=True)):
+            own = self._columns[:, c * self._count : (c + 1) * self._count]
+            for weights in self._weights[:, :, a:b]:
+                affine = np.concatenate([np.ones((1, b - a), np.float32), weights])
+                squares += np.einsum("mp,pq,mq->m", own, affine @ affine.T, own, optimize=True)
+        return np.sqrt(np.maximum(squares, 0)).astype(np.float32)
+
+    @property
+    def prepared_bytes(self) -> int:
+        kept = (self._columns, self._weights, self._order, self._sums, self._done, self._rows, self.incident)
+        return sum(array.nbytes for array in kept)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _add_to_clusters(
+    columns: Floats, update: tuple[Ints, Floats, Ints, NDArray[np.bool_]], sums: Doubles
+) -> Doubles:
+    """Coefficients of clusters (3, values) from columns (m, values); ``sums`` (groups, 3, values) are updated."""
+    coefficients, changes, group_starts, resets = update
+    values = columns.shape[1]
+    total = np.zeros((3, values))
+    for chunk in numba.prange(-(-values // COEFFICIENTS)):
+        first, last = chunk * COEFFICIENTS, min((chunk + 1) * COEFFICIENTS, values)
+        for g in range(len(resets)):
+            for colour in range(3):
+                own = sums[g, colour, first:last]
+                if resets[g]:
+                    own[:] = 0
+                for k in range(group_starts[g], group_starts[g + 1]):
+                    change, column = np.float64(changes[k, colour]), columns[coefficients[k], first:last]
+                    for q in range(len(own)):
+                        own[q] += change * column[q]
+                total[colour, first:last] += own
+    return total
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _add_to_rows(
+    clusters: tuple[Doubles, Doubles, Doubles],
+    layout: tuple[Floats, Ints, Ints],
+    frame: tuple[int, int],
+    rows: Floats,
+    incident: Floats,
+) -> None:
+    """Add to rows (3, n), by cluster, what coefficients of clusters changed; and list them in their own order.
+
+    ``clusters``: coefficients now and as the rows show them, both (3, values), and norms of weights (clusters, b).
+    ``layout``: weights (channels, b, n), where clusters start, and the order of rows. ``frame``: vectors to apply, and
+    the frame's number, which says which clusters are summed anew.
+    """
+    now, done, norms = clusters
+    weights, starts, order = layout
+    vectors, turn = frame
+    channels, b = weights.shape[:2]
+    for c in numba.prange(len(starts) - 1):
+        first, last, base = starts[c], starts[c + 1], c * (b + 1)
+        anew = c % REFRESH == turn
+        if anew:
+            done[:, base : base + b + 1] = 0
+            rows[:, first:last] = 0
+        for colour in range(3):
+            change = np.float32(now[colour, base] - done[colour, base])
+            if change != 0:
+                done[colour, base] = now[colour, base]
+                for i in range(first, last):
+                    rows[colour, i] += change
+        chosen = _most_changed(now, done, norms[c], base, b if anew else vectors)
+        for q in chosen:
+            for colour in range(3):
+                change = np.float32(now[colour, base + 1 + q] - done[colour, base + 1 + q])
+                done[colour, base + 1 + q] = now[colour, base + 1 + q]
+                weight, own = weights[colour % channels, q, first:last], rows[colour, first:last]
+                for i in range(len(own)):
+                    own[i] += change * weight[i]
+        for i in range(first, last):
+            for colour in range(3):
+                incident[order[i], colour] = rows[colour, i]
+
+
+@numba.njit(inline="always")
+def _most_changed(now: Doubles, done: Doubles, norms: Doubles, base: int, count: int) -> Ints:
+    """Vectors of a cluster whose change matters most, so many at most; none that did not change."""
+    b = len(norms)
+    sizes = np.empty(b)
+    for q in range(b):
+        square = 0.0
+        for colour in range(3):
+            square += (now[colour, base + 1 + q] - done[colour, base + 1 + q]) ** 2
+        sizes[q] = norms[q] * np.sqrt(square)
+    order = np.argsort(-sizes) if count < b else np.arange(b)
+    chosen = order[: min(count, b)]
+    return chosen[sizes[chosen] > 0]
