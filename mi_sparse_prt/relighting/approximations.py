@@ -338,10 +338,10 @@ def _best_combination(
     among the coarse bands is taken.
     """
     bands = lengths.shape[1]
-    best, resets, counts = np.inf, np.zeros(bands, np.bool_), np.zeros(bands, np.int64)
+    best, resets, counts = np.float64(np.inf), np.zeros(bands, np.bool_), np.zeros(bands, np.int64)
     taken = np.zeros(bands, np.int64)
     for combination in range(1 << bands):
-        left = 0.0
+        left = np.float64(0)
         for b in range(bands):
             taken[b] = 0
             left += totals[(combination >> (bands - 1 - b)) & 1, b]

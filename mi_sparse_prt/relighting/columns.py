@@ -1,7 +1,7 @@
 """T by wavelets and columns: what moving light reads, where compression keeps rows ([NRH03], [OBRG06] equation 1).
 
-Columns are transposed lists of ``operators.haar_rows``: the same numbers, in blocks of rows, so that the sums of a block
-stay in the cache and a place within it has 16 bits.
+Columns are transposed lists of ``operators.haar_rows``: the same numbers, in blocks of rows, so that the sums
+of a block stay in the cache and a place within it has 16 bits.
 """
 
 from __future__ import annotations
