@@ -17,10 +17,14 @@ def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float) -> byt
     if suffix == ".exr":
         mi.Bitmap(np.ascontiguousarray(image)).write(stream, mi.Bitmap.FileFormat.OpenEXR)
     else:
-        bitmap = mi.Bitmap(np.ascontiguousarray(image * np.float32(2.0**exposure)))
-        bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-        bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
+        mi.Bitmap(srgb_pixels(image, exposure)).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
+
+
+def srgb_pixels(image: NDArray[np.float32], exposure: float) -> NDArray[np.uint8]:
+    """A linear RGB image (height, width, 3) in sRGB, brightened by ``exposure`` stops."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(image * np.float32(2.0**exposure)))
+    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
 
 
 def vertices_bytes(scene: Scene, radiance: NDArray[np.float32], suffix: str) -> bytes:

@@ -1,9 +1,11 @@
-"""``mi-sparse-prt relight``: from a matrix file and an environment to an image."""
+"""``mi-sparse-prt relight``: from a matrix file and an environment to an image, or to a film."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +15,15 @@ from mi_sparse_prt.cli.running import running
 from mi_sparse_prt.cli.tables.written import relighting_table
 from mi_sparse_prt.core.errors import PrtError
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mi_sparse_prt import Environment, LightTransport, Scene
+    from mi_sparse_prt.core.profiling import Stopwatch
+
+FILM = ".mp4"
+
 EnvironmentFile = Annotated[
     Path,
     options.file_option(
@@ -20,14 +31,37 @@ EnvironmentFile = Annotated[
     ),
 ]
 ImageFile = Annotated[
-    Path | None, options.file_option("--output", "-o", help="Image to write: .png (sRGB) or .exr (linear).")
+    Path | None,
+    options.file_option(
+        "--output",
+        "-o",
+        help="Image to write: .png (sRGB) or .exr (linear). With --frames: a film (.mp4), or a folder for .png files.",
+    ),
 ]
 VerticesFile = Annotated[
     Path | None,
     options.file_option(help="Radiance of the vertices: .npy (n_v, 3), or .ply with linear colours."),
 ]
-Rotate = Annotated[float, typer.Option(metavar="DEGREES", help="Turn the environment about +y, the up axis.")]
-Exposure = Annotated[float, typer.Option(metavar="STOPS", help="Brighten a .png by this power of two.")]
+Rotate = Annotated[
+    float,
+    typer.Option(
+        metavar="DEGREES",
+        help="Turn the environment about +y, the up axis; with --frames, from 0 to this, at constant speed.",
+    ),
+]
+Exposure = Annotated[
+    float, typer.Option(metavar="STOPS", help="Brighten a .png, or all of a film, by this power of two.")
+]
+FrameCount = Annotated[
+    int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
+]
+LastEnvironment = Annotated[
+    Path | None,
+    options.file_option(
+        "--to", metavar="ENV", help="Environment of the last frame: the light becomes this one step by step."
+    ),
+]
+FrameRate = Annotated[float, typer.Option("--fps", help="Frames of a film per second.")]
 Sensor = Annotated[int, typer.Option(help="Which of the scene's cameras.")]
 Samples = Annotated[
     int, typer.Option(help="Samples per pixel, for edges and textures: the light has no noise.")
@@ -40,6 +74,22 @@ MatrixScene = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class _View:
+    """What is lit, and how it is looked at."""
+
+    scene: Scene
+    transport: LightTransport
+    sensor: int
+    spp: int
+
+    def image(self, light: Environment, progress: bool = False) -> NDArray[np.float32]:
+        """Linear RGB, (row, column, rgb)."""
+        from mi_sparse_prt import render
+
+        return render(self.scene, self.transport, light, self.sensor, self.spp, progress=progress)
+
+
 def relight(
     matrix: options.MatrixFile,
     environment: EnvironmentFile,
@@ -47,6 +97,9 @@ def relight(
     vertices: VerticesFile = None,
     rotate: Rotate = 0.0,
     exposure: Exposure = 0.0,
+    frames: FrameCount = None,
+    to: LastEnvironment = None,
+    fps: FrameRate = 30.0,
     sensor: Sensor = 0,
     spp: Samples = 64,
     scene: MatrixScene = None,
@@ -55,54 +108,117 @@ def relight(
     json_file: options.JsonFile = None,
     quiet: options.Quiet = False,
 ) -> None:
-    """Light a scene with an environment through its matrix, and write the camera's image.
+    """Light a scene with an environment through its matrix, and write the camera's image, or a film.
 
     Example: mi-sparse-prt relight bunny.prt -e scenes_xml/envmaps/city.exr --rotate 90 -o bunny.png
-    """
-    if output is None and vertices is None:
-        raise typer.BadParameter("nothing to write: give -o IMAGE or --vertices FILE", param_hint="-o")
-    _check_suffix(output, (".png", ".exr"), "-o")
-    _check_suffix(vertices, (".npy", ".ply"), "--vertices")
-    with running(json_file, quiet, outputs=[output, vertices]) as command:
-        # before the clock starts
-        from mi_sparse_prt import load_environment, load_transport, render
-        from mi_sparse_prt.cli.files import image_bytes, vertices_bytes
-        from mi_sparse_prt.core.profiling import Stopwatch
 
+    A film: mi-sparse-prt relight bunny.prt -e scenes_xml/envmaps/city.exr --rotate 360 --frames 120 -o bunny.mp4
+    """
+    if frames is None:
+        _check_pictures(output, vertices, to)
+    else:
+        _check_film(output, vertices, frames, fps)
+    folder = frames is not None and output is not None and not _is_film(output)
+    with running(json_file, quiet, outputs=[None if folder else output, vertices]) as command:
+        # before the clock starts
+        from mi_sparse_prt import load_environment, load_transport
+        from mi_sparse_prt.cli.film import check_frame_folder, make_film
+        from mi_sparse_prt.core.profiling import Stopwatch
+        from mi_sparse_prt.relighting.film import film_lights
+
+        if frames is not None and output is not None and folder:
+            check_frame_folder(output, frames)
         clock = Stopwatch()
+        with command.prompt_interrupts(), clock.phase("load"):
+            light, last = load_environment(environment), None if to is None else load_environment(to)
+            loaded = with_scene(load_transport(matrix), matrix, scene, options.definitions(define))
         report: dict[str, Any] = {"matrix": str(matrix), "rotation_degrees": rotate}
-        files: dict[Path, bytes] = {}
-        with command.prompt_interrupts():
-            with clock.phase("load"):
-                light = load_environment(environment).rotated(rotate)
-                loaded, transport = with_scene(
-                    load_transport(matrix), matrix, scene, options.definitions(define)
+        report["environment"] = light.report
+        view = _View(*loaded, sensor, spp)
+        if vertices is not None and view.transport.terms:
+            raise PrtError(f"{matrix} has glossy surfaces, whose light depends on the view: give -o instead")
+        if frames is not None and output is not None:
+            if last is not None:
+                report["to"] = last.report
+            with clock.phase("render"):
+                images = map(view.image, film_lights(light, last, rotate, frames))
+                report["film"] = make_film(command, images, frames, output, folder, fps, exposure, not quiet)
+            sizes = {output: report["film"]["bytes"]}
+        else:
+            with command.prompt_interrupts():
+                files = _pictures(
+                    view, light.rotated(rotate), output, vertices, exposure, not quiet, clock, report
                 )
-            report["environment"] = light.report
-            if vertices is not None and transport.terms:
-                raise PrtError(
-                    f"{matrix} has glossy surfaces, whose light depends on the view: give -o instead"
-                )
-            with clock.phase("relight"):
-                radiance = transport.relight(light)  # [vertex, rgb]
-            if vertices is not None:
-                files[vertices] = vertices_bytes(loaded, radiance, vertices.suffix.lower())
-                report["vertices"] = {"path": str(vertices), "mean": radiance.mean(axis=0).tolist()}
-            if output is not None:
-                with clock.phase("render"):
-                    # [row, column, rgb]
-                    image = render(loaded, transport, light, sensor, spp, progress=not quiet)
-                files[output] = image_bytes(image, output.suffix.lower(), exposure)
-                report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
-        for path, content in files.items():
-            command.write(path, content)
+            for path, content in files.items():
+                command.write(path, content)
+            sizes = {path: len(content) for path, content in files.items()}
         command.report = report | {"seconds": clock.report()}
         title = f"{matrix} under {environment}, turned by {rotate:g} degrees"
-        command.show(relighting_table(title, clock.seconds, files))
+        command.show(relighting_table(title, clock.seconds, sizes))
 
 
-def _check_suffix(path: Path | None, suffixes: tuple[str, ...], option: str) -> None:
+def _pictures(
+    view: _View,
+    light: Environment,
+    output: Path | None,
+    vertices: Path | None,
+    exposure: float,
+    progress: bool,
+    clock: Stopwatch,
+    report: dict[str, Any],
+) -> dict[Path, bytes]:
+    """Contents of the files of one light, and what the report says of them."""
+    from mi_sparse_prt.cli.files import image_bytes, vertices_bytes
+
+    files = {}
+    with clock.phase("relight"):
+        radiance = view.transport.relight(light)  # [vertex, rgb]
+    if vertices is not None:
+        files[vertices] = vertices_bytes(view.scene, radiance, vertices.suffix.lower())
+        report["vertices"] = {"path": str(vertices), "mean": radiance.mean(axis=0).tolist()}
+    if output is not None:
+        with clock.phase("render"):
+            image = view.image(light, progress)
+        files[output] = image_bytes(image, output.suffix.lower(), exposure)
+        report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
+    return files
+
+
+def _check_pictures(output: Path | None, vertices: Path | None, to: Path | None) -> None:
+    if output is None and vertices is None:
+        raise typer.BadParameter("nothing to write: give -o IMAGE or --vertices FILE", param_hint="-o")
+    if to is not None:
+        raise typer.BadParameter(
+            f"{to} would be the light at the end of a film: give --frames, too", param_hint="--to"
+        )
+    _check_suffix(output, (".png", ".exr"), "-o", "; a film or a folder needs --frames")
+    _check_suffix(vertices, (".npy", ".ply"), "--vertices")
+
+
+def _check_film(output: Path | None, vertices: Path | None, frames: int, fps: float) -> None:
+    if frames < 1:
+        raise typer.BadParameter(f"{frames} frames: give 1 or more", param_hint="--frames")
+    if vertices is not None:
+        raise typer.BadParameter(
+            f"{vertices}: vertices have no film: leave out --frames", param_hint="--vertices"
+        )
+    if output is None:
+        raise typer.BadParameter(f"nothing to write: give -o FILM{FILM} or -o FOLDER", param_hint="-o")
+    if not 0 < fps < math.inf:
+        raise typer.BadParameter(f"{fps} frames per second: give a number above 0", param_hint="--fps")
+    if not (_is_film(output) or output.is_dir() or output.suffix == ""):
+        raise typer.BadParameter(
+            f"{output}: give a name that ends in {FILM}, or a folder without a dot in its name",
+            param_hint="-o",
+        )
+
+
+def _is_film(output: Path) -> bool:
+    return output.suffix.lower() == FILM and not output.is_dir()
+
+
+def _check_suffix(path: Path | None, suffixes: tuple[str, ...], option: str, more: str = "") -> None:
     if path is not None and path.suffix.lower() not in suffixes:
         raise typer.BadParameter(
-            f"{path}: give a name that ends in {' or '.join(suffixes)}", param_hint=option
+            f"{path}: give a name that ends in {' or '.join(suffixes)}{more}", param_hint=option
         )

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,15 @@ class Command:
         for table in tables:
             self._console.print(table)
 
-    def write(self, path: Path, content: bytes) -> None:
+    def write(self, path: Path, content: bytes, part_of: Path | None = None) -> None:
         """Write a file under a temporary name beside it, and rename it when it is complete.
+
+        Parameters
+        ----------
+        path : Path
+        content : bytes
+        part_of : Path, optional
+            The folder that counts as written, if the file is one of many.
 
         Raises
         ------
@@ -61,7 +68,8 @@ class Command:
             ) from None
         finally:
             temporary.unlink(missing_ok=True)
-        self.written.append(path)
+        if (part_of or path) not in self.written:
+            self.written.append(part_of or path)
 
     def interrupted(self) -> str:
         """What Ctrl-C left behind, in a line."""
@@ -97,6 +105,31 @@ class Command:
             watcher.join()
             os.close(reader)
             os.close(writer)
+
+    @contextmanager
+    def patient_interrupts(self) -> Iterator[Callable[[], None]]:
+        """Let Ctrl-C wait for a call of the function that is given: it raises it where nothing is half done.
+
+        A second Ctrl-C does not wait.
+        """
+        usual, asked = signal.getsignal(signal.SIGINT), threading.Event()
+
+        def wait(*_: object) -> None:
+            asked.set()
+            signal.signal(signal.SIGINT, usual)
+
+        def let_interrupt() -> None:
+            if asked.is_set():
+                raise KeyboardInterrupt
+
+        heard = callable(usual)  # in the background of a shell, it may be ignored
+        if heard:
+            signal.signal(signal.SIGINT, wait)
+        try:
+            yield let_interrupt
+        finally:
+            if heard:
+                signal.signal(signal.SIGINT, usual)
 
 
 @contextmanager

@@ -1,0 +1,191 @@
+"""Pictures that follow each other, as files of a folder or as a film, of which an interruption loses none."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from mi_sparse_prt.cli.files import image_bytes, srgb_pixels
+from mi_sparse_prt.cli.running import Command, check_folder
+from mi_sparse_prt.core.errors import PrtError
+
+DIGITS = 4  # of the names of pictures, at least
+QUALITY = 16  # constant rate factor of H.264: no difference is seen below about 18
+# as ITU-T H.273 numbers them: without them, players guess by the size of the picture
+BT709, SRGB_CURVE, STUDIO_RANGE = 1, 13, 1
+
+
+class Frames(Protocol):
+    """Where frames go."""
+
+    def add(self, image: NDArray[np.float32]) -> None:
+        """The next one, linear RGB (height, width, 3)."""
+
+    def finish(self) -> int:
+        """Nothing more comes; the size of all in bytes."""
+
+
+class FrameFolder:
+    """Frames as 0000.png, 0001.png, ... in a folder; each appears whole or not at all.
+
+    Parameters
+    ----------
+    command : Command
+    folder : Path
+        Made if it is not there.
+    frames : int
+        How many there will be.
+    exposure : float
+        In stops.
+    """
+
+    def __init__(self, command: Command, folder: Path, frames: int, exposure: float) -> None:
+        self._command, self._folder, self._exposure = command, folder, exposure
+        folder.mkdir(parents=True, exist_ok=True)
+        self._names, self._size = iter(_names(frames)), 0
+
+    def add(self, image: NDArray[np.float32]) -> None:
+        content = image_bytes(image, ".png", self._exposure)
+        self._size += len(content)
+        self._command.write(self._folder / next(self._names), content, part_of=self._folder)
+
+    def finish(self) -> int:
+        return self._size
+
+
+class FilmFile:
+    """Frames as an H.264 film; it is kept in memory, and written when it is finished.
+
+    Parameters
+    ----------
+    command : Command
+    path : Path
+    fps : float
+        Frames per second.
+    exposure : float
+        In stops.
+    """
+
+    def __init__(self, command: Command, path: Path, fps: float, exposure: float) -> None:
+        import av
+
+        self._command, self._path, self._exposure = command, path, exposure
+        self._rate = Fraction(fps).limit_denominator(1001)  # a float has one of 2^52
+        self._content = io.BytesIO()
+        self._container = av.open(self._content, "w", format="mp4")
+        self._stream: Any = None
+
+    def add(self, image: NDArray[np.float32]) -> None:
+        import av
+
+        height, width = image.shape[:2]
+        # colours of 2 x 2 pixels are stored together
+        image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        if self._stream is None:
+            self._stream = self._new_stream(*image.shape[:2])
+        frame = av.VideoFrame.from_ndarray(srgb_pixels(image, self._exposure), "rgb24")
+        frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+        self._container.mux(self._stream.encode(frame))
+
+    def finish(self) -> int:
+        if self._stream is None:  # no frame was done
+            return 0
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+        self._command.write(self._path, self._content.getvalue())
+        return self._content.getbuffer().nbytes
+
+    def _new_stream(self, height: int, width: int) -> Any:
+        stream: Any = self._container.add_stream("libx264", self._rate, {"crf": str(QUALITY)})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        codec = stream.codec_context
+        codec.colorspace = codec.color_primaries = BT709
+        codec.color_trc, codec.color_range = SRGB_CURVE, STUDIO_RANGE
+        return stream
+
+
+def check_frame_folder(folder: Path, frames: int) -> None:
+    """Find out before the work whether frames can be written into a folder, which may still have to be made.
+
+    Raises
+    ------
+    PrtError
+        If they cannot, or if the folder holds frames of a longer film, which would follow these.
+    """
+    check_folder(folder)
+    there = {path.name for path in folder.glob("*.png") if path.stem.isdecimal()}
+    others = there - {*_names(frames)}
+    if others:
+        raise PrtError(
+            f"{folder} has frames of a longer film, such as {min(others)}: remove them or choose another folder"
+        )
+
+
+def _names(frames: int) -> list[str]:
+    digits = max(DIGITS, len(str(frames - 1)))
+    return [f"{frame:0{digits}}.png" for frame in range(frames)]
+
+
+def make_film(
+    command: Command,
+    images: Iterable[NDArray[np.float32]],
+    frames: int,
+    output: Path,
+    folder: bool,
+    fps: float,
+    exposure: float,
+    progress: bool,
+) -> dict[str, Any]:
+    """Write images (height, width, 3), linear RGB, one after the other.
+
+    Parameters
+    ----------
+    command : Command
+    images : iterable
+        All of one size.
+    frames : int
+        How many images there are.
+    output : Path
+    folder : bool
+        Whether the output is a folder; else it is a film file.
+    fps : float
+        Frames per second, of a film file.
+    exposure : float
+        In stops; the same for all frames.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    dict
+        What the report says of it.
+
+    Raises
+    ------
+    PrtError
+        If it cannot be written.
+    KeyboardInterrupt
+        After Ctrl-C, when the frame that was begun and all before it are written.
+    """
+    into: Frames
+    if folder:
+        into = FrameFolder(command, output, frames, exposure)
+    else:
+        into = FilmFile(command, output, fps, exposure)
+    with command.patient_interrupts() as let_interrupt:
+        try:
+            bar = tqdm(images, "film", frames, unit=" frames", disable=not progress)
+            for done, image in enumerate(bar, 1):
+                into.add(image)
+                command.hint = f": {done} of {frames} frames"
+                let_interrupt()
+        finally:
+            size = into.finish()
+    return {"path": str(output), "frames": frames, "bytes": size} | ({} if folder else {"fps": fps})
