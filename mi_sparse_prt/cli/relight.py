@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -204,8 +203,8 @@ def _check_film(output: Path | None, vertices: Path | None, frames: int, fps: fl
         )
     if output is None:
         raise typer.BadParameter(f"nothing to write: give -o FILM{FILM} or -o FOLDER", param_hint="-o")
-    if not 0 < fps < math.inf:
-        raise typer.BadParameter(f"{fps} frames per second: give a number above 0", param_hint="--fps")
+    if not 0.1 <= fps <= 1000:
+        raise typer.BadParameter(f"{fps} frames per second: give 0.1 to 1000", param_hint="--fps")
     if not (_is_film(output) or output.is_dir() or output.suffix == ""):
         raise typer.BadParameter(
             f"{output}: give a name that ends in {FILM}, or a folder without a dot in its name",

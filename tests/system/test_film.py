@@ -192,7 +192,7 @@ def test_an_interruption_before_the_first_frame_leaves_no_film(film, tmp_path, m
         (["--frames", "2"], "-o FOLDER"),
         (["-o", "film.avi", "--frames", "2"], "ends in .mp4"),
         (["-o", "film.mp4", "--frames", "0"], "give 1 or more"),
-        (["-o", "film.mp4", "--frames", "2", "--fps", "0"], "above 0"),
+        (["-o", "film.mp4", "--frames", "2", "--fps", "0"], "give 0.1 to 1000"),
         (["-o", "film.mp4", "--frames", "2", "--vertices", "a.npy"], "leave out --frames"),
     ],
     ids=["no frames", "to without frames", "no output", "suffix", "none", "no rate", "vertices"],
