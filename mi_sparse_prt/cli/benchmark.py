@@ -59,11 +59,16 @@ Zoo = Annotated[
         help="Render a small scene for each of Mitsuba's plugins instead, and say which come out right.",
     ),
 ]
+Moving = Annotated[
+    bool,
+    typer.Option("--relight", help="Measure errors and times of frames under a light that moves instead."),
+]
 Figures = Annotated[
     Path | None,
     options.file_option(
         metavar="FOLDER",
-        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy or --zoo measures: "
+        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy, --zoo or --relight "
+        "measures: "
         "PNG files there.",
     ),
 ]
@@ -87,6 +92,7 @@ def benchmark(
     cpca: Cpca = False,
     glossy: Glossy = False,
     zoo: Zoo = False,
+    moving: Moving = False,
     figures: Figures = None,
     edge_length: options.EdgeLength = None,
     define: options.Define = None,
@@ -102,7 +108,8 @@ def benchmark(
     With --choices --figures FOLDER: its Figures 5 and 6. With --time-error --figures FOLDER: all methods on one plot.
     With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
     With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
-    images, its Figures 17 to 19. With --zoo --figures FOLDER: what is compatible, beside Mitsuba's path.
+    images, its Figures 17 to 19. With --zoo --figures FOLDER: what is compatible, beside Mitsuba's path. With --relight
+    --figures FOLDER: light that moves, Figures 2 to 9 of the paper on temporal coherence.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -115,6 +122,7 @@ def benchmark(
         "--cpca": cpca,
         "--glossy": glossy,
         "--zoo": zoo,
+        "--relight": moving,
     }
     which = _only_one(asked)
     varied = edge_length is not None or resolution != options.DEFAULT_RESOLUTION or (zoo and bool(define))
@@ -169,6 +177,7 @@ def _measurement(
     from mi_sparse_prt.cli.tables import benchmark as tables
     from mi_sparse_prt.cli.tables.choices import choices_tables
     from mi_sparse_prt.cli.tables.methods import methods_tables
+    from mi_sparse_prt.cli.tables.moving_light import moving_light_tables
     from mi_sparse_prt.cli.tables.zoo import zoo_tables
 
     kinds: dict[str, tuple[Callable[..., dict[str, Any]], Callable[[dict[str, Any]], list[Table]]]] = {
@@ -184,5 +193,6 @@ def _measurement(
         "--cpca": (benchmarks.measure_cpca, tables.cpca_tables),
         "--glossy": (benchmarks.measure_glossy, tables.glossy_tables),
         "--zoo": (benchmarks.measure_zoo, zoo_tables),
+        "--relight": (benchmarks.measure_moving_light, moving_light_tables),
     }
     return kinds[which]

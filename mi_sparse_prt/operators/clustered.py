@@ -104,7 +104,7 @@ class Clustered(Operator):
         k, b, m = self.bases.shape
         return multiply_converted(self.means, scaled), multiply_converted(
             self.bases.reshape(k * b, m), scaled
-        ).reshape(k, b, -1)
+        ).reshape(k, b, vectors.shape[1])
 
     def _combined(self, means: Floats, products: Floats, channels: slice = slice(None)) -> Floats:
         """What rows have where means have (k, any) and basis vectors (k, b, any): (n, channels, any)."""

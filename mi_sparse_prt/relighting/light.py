@@ -22,7 +22,7 @@ FINER = 4  # texels of the stored cubemap along the edge of one of the light's
 FINEST = 256  # along a face: more would take seconds to prepare
 LOOKUPS, MORE_LOOKUPS = 2, 8  # along the edge of a texel
 SHARP = 4.0  # differences within a texel, in means over the sphere, above which it gets more lookups
-BORDER = 8  # squares along the edge of a texel that the border of a disc crosses
+BORDER, MOST_BORDER = 8, 256  # squares along the edge of a texel that the border of a disc crosses
 
 
 class TurningLight:
@@ -90,14 +90,16 @@ def disc(lighting: CubemapLighting, towards: ArrayLike, degrees: float, radiance
         raise PrtError(f"a light cannot lie in the direction {towards!r}: give three numbers, not all 0")
     if not 0 < degrees <= 180:
         raise PrtError(f"a light of {degrees} degrees: its radius is above 0, and 180 at most")
-    n, centre = lighting.resolution, centre / length
+    n, radius, centre = lighting.resolution, np.radians(degrees), centre / length
     angles = np.arccos(np.clip(lighting.directions @ centre, -1, 1))
-    covered = (angles < np.radians(degrees)).astype(np.float32)
-    near = np.flatnonzero(np.abs(angles - np.radians(degrees)) < 2 / n)  # no texel reaches farther
-    directions, parts = subtexels(near, n, BORDER)
-    inside = directions @ centre > np.cos(np.radians(degrees))
+    covered = (angles < radius).astype(np.float64)
+    near = np.flatnonzero(np.abs(angles - radius) < 2 / n)  # no texel reaches farther
+    squares = int(np.clip(np.ceil(8 / (n * radius)), BORDER, MOST_BORDER))  # a quarter of the radius
+    directions, parts = subtexels(near, n, squares)
+    inside = directions @ centre > np.cos(radius)
     covered[near] = (inside * parts).sum(axis=1) / parts.sum(axis=1)
-    return covered[:, None] * np.broadcast_to(np.asarray(radiance, np.float32), 3)
+    covered *= 2 * np.pi * (1 - np.cos(radius)) / max(covered @ lighting.solid_angles, 1e-30)
+    return covered[:, None].astype(np.float32) * np.broadcast_to(np.asarray(radiance, np.float32), 3)
 
 
 def _padded(texels: Floats, n: int) -> Floats:

@@ -138,12 +138,13 @@ class Relighter:
         reflection, measurement = self.transport.reflection, self.transport.measurement
         incident = self.player.incident
         if isinstance(reflection, Diffuse) and measurement.weights is None:
-            return _times(reflection.albedo, incident)
+            return albedo_times(reflection.albedo, incident)
         return self.transport.leaving(incident, outgoing)
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _times(albedo: Floats, incident: Floats) -> Floats:
+def albedo_times(albedo: Floats, incident: Floats) -> Floats:
+    """(n, 3) radiance of diffuse points."""
     result = np.empty_like(incident)
     for i in numba.prange(len(incident)):
         for c in range(3):

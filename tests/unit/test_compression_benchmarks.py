@@ -1,4 +1,4 @@
-"""``benchmark --cpca`` and ``--glossy`` from end to end on tiny scenes: reports, pictures, tables."""
+"""``benchmark --cpca``, ``--glossy`` and ``--relight`` from end to end on tiny scenes: reports, pictures, tables."""
 
 import io
 import json
@@ -13,7 +13,9 @@ from rich.console import Console
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.clustered_pca import measure_cpca
 from mi_sparse_prt.benchmark.glossy_transport import GlossyEffort, diffuse_copy, measure_glossy
+from mi_sparse_prt.benchmark.moving_light import METHODS, MovingEffort, measure_moving_light
 from mi_sparse_prt.cli.tables.benchmark import cpca_tables, glossy_tables
+from mi_sparse_prt.cli.tables.moving_light import moving_light_tables
 from mi_sparse_prt.scene.scene import Scene
 
 
@@ -61,6 +63,31 @@ def test_cpca(tmp_path) -> None:
     for name in ("clusters", "compressed"):
         assert np.ptp(matplotlib.image.imread(tmp_path / f"{name}.png")) > 0.1
     assert "ball" in printed(cpca_tables(report))
+
+
+def test_moving_light(tmp_path) -> None:
+    """What holds for any turn: more wavelets are better, those that go on better than those that start anew."""
+    scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(frames=20, still=8, degrees=(60.0,))
+    report = measure_moving_light(scene, prt.CubemapLighting(8), False, tmp_path, effort)
+    json.dumps(report)
+    assert report["turning"].keys() == {"sky", "sun"}
+    for turns in report["turning"].values():
+        methods = turns["60"]["methods"]
+        assert methods.keys() == METHODS.keys()
+        for key in ("light", "sphere", "image"):
+            assert methods["NWA(30)"][key] > methods["NWA(60)"][key] > methods["NWA(150)"][key] >= 0
+            assert methods["PBI(30)"][key] < methods["NWA(30)"][key]
+        assert methods["PBI(30)"]["frames"][0] == 0 and methods["PBI(30)"]["frames"][-1] < 0.05
+        assert (
+            turns["60"]["stop"]["PBI(30)"]["NWA(300)"] is None
+            or turns["60"]["stop"]["PBI(30)"]["NWA(300)"] < 9
+        )
+    frames = report["frames"]
+    assert frames["product"]["bytes"] == 4 * len(scene.positions) * 384
+    assert all(way["per_second"] > 0 for way in frames.values() if "per_second" in way)
+    for name in ("lights", "coverage", "energy", "errors", "bands"):
+        assert np.ptp(matplotlib.image.imread(tmp_path / f"moving_{name}.png")) > 0.1
+    assert "a quarter of the weights" in printed(moving_light_tables(report))
 
 
 def test_glossy(tmp_path) -> None:
