@@ -36,8 +36,6 @@ from mi_sparse_prt.relighting.sequences import turning
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.validation.validate import save_figures
 
-TARGET = 0.02  # error of the matrix
-
 Floats = NDArray[np.float32]
 Report = dict[str, Any]
 
@@ -51,11 +49,14 @@ class MovingEffort:
     frames, still : int
     degrees : tuple of float
         Of the turns.
+    target_error : float
+        Of the matrix.
     """
 
     frames: int = 100
     still: int = 60
     degrees: tuple[float, ...] = (60, 180, 360)
+    target_error: float = 0.02
 
 
 PAPER = MovingEffort()
@@ -110,7 +111,7 @@ def measure_moving_light(
         the error is below that of others, still. ``vectors``: relative L2 of a quarter of the weights. ``frames``: see
         ``measure_frames``. ``matrix``: errors and sizes of what is played.
     """
-    transport = precompute(scene, lighting, target_error=TARGET, progress=progress)
+    transport = precompute(scene, lighting, target_error=effort.target_error, progress=progress)
     compressed = compress(transport, progress=progress)
     operator = compressed.operators["compressed"]
     assert hasattr(operator, "bases")

@@ -67,7 +67,7 @@ def test_cpca(tmp_path) -> None:
 
 def test_moving_light(tmp_path) -> None:
     """What holds for any turn: more wavelets are better, those that go on better than those that start anew."""
-    scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(frames=20, still=8, degrees=(60.0,))
+    scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(20, 8, (60,), target_error=0.2)
     report = measure_moving_light(scene, prt.CubemapLighting(8), False, tmp_path, effort)
     json.dumps(report)
     assert report["turning"].keys() == {"sky", "sun"}
