@@ -13,6 +13,7 @@ from mi_sparse_prt.benchmark.measuring import describe_machine
 from mi_sparse_prt.benchmark.zoo_figures import SceneImages, draw_contact_sheet
 from mi_sparse_prt.benchmark.zoo_rendering import (
     DONE,
+    ERROR,
     Pair,
     Rendering,
     RenderingProcess,
@@ -106,21 +107,24 @@ def _measure_scene(process: RenderingProcess, path: Path, effort: ZooEffort) -> 
     """The report of a scene, and what there is of its pictures."""
     outcome, truth = process.call(render_reference, path, effort, seconds=REFERENCE_SECONDS)
     if outcome != DONE:
-        return _without_picture(path, outcome, f"path: {truth}"), SceneImages()
+        return _without_picture(path.stem, outcome, f"path: {truth}"), SceneImages()
     outcome, ours = process.call(render_matrix, path, effort, seconds=effort.seconds)
     reference = np.mean(truth, axis=0)
     if outcome != DONE:
-        return _without_picture(path, outcome, ours), SceneImages(reference)
+        return _without_picture(path.stem, outcome, ours), SceneImages(reference)
     return judge(path.stem, ours, truth), SceneImages(reference, np.mean(ours.images, axis=0))
 
 
-def _without_picture(path: Path, outcome: str, sentence: str) -> Report:
+def _without_picture(name: str, outcome: str, sentence: str) -> Report:
     unknown = dict.fromkeys(("error", "uncertainty", "noise", "seconds", "estimated_error"))
-    return {"name": path.stem, "verdict": outcome, **unknown, "told_by": [], "sentences": [sentence]}
+    return {"name": name, "verdict": outcome, **unknown, "told_by": [], "sentences": [sentence]}
 
 
 def judge(name: str, ours: Rendering, truth: Pair) -> Report:
     """The report of a scene of which there are pictures by both."""
+    for whose, pictures in (("path", truth), ("sparse_prt", ours.images)):
+        if not np.isfinite(pictures).all():  # NaN would be no different from anything
+            return _without_picture(name, ERROR, f"{whose}: pixels are NaN or infinite")
     error, uncertainty = image_error(ours.images, truth)
     about_picture = [w for w in ours.warnings if not any(part in w for part in NOT_ABOUT_PICTURES)]
     told = told_by(error, ours.estimated_error, bool(about_picture))

@@ -101,6 +101,15 @@ def test_errors_are_found_beneath_noise():
     assert (found["verdict"], found["told_by"]) == ("told to be off", ["warning"])
 
 
+def test_pictures_with_nan_do_not_agree():
+    """As those of curves that Mitsuba read beyond their end: they were no different from anything."""
+    right = tuple(np.random.default_rng(2).random((2, 8, 9, 3)).astype(np.float32))
+    wrong = tuple(np.where(np.arange(9)[:, None] == 4, np.nan, image) for image in right)
+    for ours, truth, whose in ((right, wrong, "path"), (wrong, right, "sparse_prt")):
+        found = judge("it", Rendering(ours, 1.0, 0.01, []), truth)
+        assert found["verdict"] == "error" and found["sentences"] == [f"{whose}: pixels are NaN or infinite"]
+
+
 def test_a_process_outlives_what_fails_in_it():
     """Expected: results, refusals, exceptions, the end of the process and of its time; and results again after each."""
     with RenderingProcess() as process:
