@@ -1,11 +1,14 @@
 """E that moves: the light of a frame in about a millisecond, instead of an exact projection of the environment.
 
-A turned environment is looked up in a cubemap four times as fine that holds its exact means. The lookups are linear, so
-that a texel of the result is a mean over squares of a quarter of its own size. Texels within which these differ much,
-at the border of a lamp, get more of them.
+An environment that turns about +y, as most do, is summed along its rows (``relighting.turntable``). One that is turned
+otherwise is looked up in a cubemap four times as fine that holds its exact means. The lookups are linear, so that a
+texel of the result is a mean over squares of a quarter of its own size. Texels within which these differ much, at the
+border of a lamp, get more of them.
 """
 
 from __future__ import annotations
+
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -15,6 +18,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cube_faces import FACE_FRAMES, subtexels, texels_towards
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.relighting.turntable import Turntable
 
 Floats = NDArray[np.float32]
 
@@ -22,6 +26,7 @@ FINER = 4  # texels of the stored cubemap along the edge of one of the light's
 FINEST = 256  # along a face: more would take seconds to prepare
 LOOKUPS, MORE_LOOKUPS = 2, 8  # along the edge of a texel
 SHARP = 4.0  # differences within a texel, in means over the sphere, above which it gets more lookups
+UPRIGHT = 1e-9  # a turn is about +y if it moves that axis by no more: 1 less the cosine
 BORDER, MOST_BORDER = 8, 256  # squares along the edge of a texel that the border of a disc crosses
 
 
@@ -32,18 +37,13 @@ class TurningLight:
     ----------
     environment : Environment
     lighting : CubemapLighting
-        Of the result; it takes two seconds to prepare one of 64 texels along an edge.
+        Of the result; the first turn takes a second or two of one with 64 texels along an edge.
     """
 
     def __init__(self, environment: Environment, lighting: CubemapLighting) -> None:
         self.environment, self.lighting = environment, lighting
-        self._fine = fine = CubemapLighting(
-            max(lighting.resolution, min(FINER * lighting.resolution, FINEST))
-        )
-        own = type(environment)(environment.pixels)  # in its own frame
-        texels = fine.project(own)
-        self._padded = _padded(texels, fine.resolution)
-        self._power = texels.T.astype(np.float64) @ fine.solid_angles  # [rgb], no turn changes it
+        power = np.einsum("hwc,hw->c", environment.pixels, environment.solid_angles)
+        self._power = power.astype(np.float64)  # [rgb], no turn changes it
 
     def turned(self, rotation: ArrayLike) -> Floats:
         """L of the turned environment, quickly: (6 n^2, 3) mean radiance of texels.
@@ -54,12 +54,30 @@ class TurningLight:
             Degrees about +y or a rotation matrix, as for ``Environment.rotated``.
         """
         matrix = self.environment.rotated(rotation).rotation
-        n, result = self.lighting.resolution, np.empty((self.lighting.n_directions, 3), np.float32)
-        frames = FACE_FRAMES.reshape(-1, 3) @ matrix  # of faces, seen from the environment
-        mean = np.float32(self._power.sum() / (4 * np.pi))
-        _resample(self._padded, frames.reshape(6, 3, 3).astype(np.float32), n, SHARP * mean, result)
+        if matrix[1, 1] > 1 - UPRIGHT and self.lighting.resolution > 1:
+            result = self._turntable.at(float(np.degrees(np.arctan2(matrix[0, 2], matrix[0, 0]))))
+        else:
+            result = self._resampled(matrix)
         found = result.T @ self.lighting.solid_angles
         result *= (self._power / np.where(found > 0, found, 1)).astype(np.float32)
+        return result
+
+    @cached_property
+    def _turntable(self) -> Turntable:
+        return Turntable(self.environment.pixels, self.lighting)
+
+    @cached_property
+    def _padded(self) -> Floats:
+        """The environment, in its own frame, as a finer cubemap with the texels beside its faces."""
+        n = self.lighting.resolution
+        fine = CubemapLighting(max(n, min(FINER * n, FINEST)))
+        return _padded(fine.project(Environment(self.environment.pixels)), fine.resolution)
+
+    def _resampled(self, matrix: NDArray[np.float64]) -> Floats:
+        n, result = self.lighting.resolution, np.empty((self.lighting.n_directions, 3), np.float32)
+        frames = FACE_FRAMES.reshape(-1, 3) @ matrix  # of faces, seen from the environment
+        sharp = np.float32(SHARP * self._power.sum() / (4 * np.pi))
+        _resample(self._padded, frames.reshape(6, 3, 3).astype(np.float32), n, sharp, result)
         return result
 
     def exact(self, rotation: ArrayLike) -> Floats:
