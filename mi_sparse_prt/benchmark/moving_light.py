@@ -155,7 +155,7 @@ class _Case:
         for k, values in enumerate(texels):
             same = k > 0 and values is texels[k - 1]
             self.light.append(
-                self.light[-1] if same else haar_colours((values * self.scale).astype(np.float32))
+                self.light[-1] if same else haar_colours(values, np.sqrt(lighting.solid_angles))
             )
         self.bands = wavelet_bands(lighting.resolution)
         self.exact = self._images(Everything(self.bands), None, turn)
@@ -179,15 +179,13 @@ class _Case:
     def _played(self, method: _Method) -> Report:
         """One method: errors of light and image."""
         bands = wavelet_bands(self.lighting.resolution, self.norms) if method.by_image else self.bands
-        approximation, area = method.make(bands), self.bands
+        approximation = method.make(bands)
         playing = ClusteredPlayer(self.operator, approximation.groups)
         light, sphere, image, flicker, resets = [], [], [], [], []
         before = np.zeros_like(self.albedo)
         for k, coefficients in enumerate(self.light):
             update = approximation.update(coefficients, method.budget if k else None)
-            approximation.bands = area
-            light.append(weighted_error(approximation, coefficients))
-            approximation.bands = bands
+            light.append(weighted_error(approximation, coefficients, self.bands))
             resets.append(update.resets.tolist())
             if 0 < k < self.turn:
                 playing.apply(update)

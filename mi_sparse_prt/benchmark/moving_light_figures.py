@@ -44,8 +44,8 @@ def moving_light_figures(report: Report, light: TurningLight, name: str) -> dict
         Of the environment, in the report.
     """
     frames = list(turning(light, DEGREES, FRAMES, STILL))
-    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)[:, None]
-    wavelets = [haar_colours(texels * scale) for texels in frames]
+    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)
+    wavelets = [haar_colours(texels, scale) for texels in frames]
     methods = report["turning"][name]
     shown = methods.get(f"{DEGREES}", next(iter(methods.values())))["methods"]
     return {
@@ -137,10 +137,10 @@ def energy_figure(light: TurningLight) -> Figure:
 def spatio_temporal_energy(light: TurningLight, period: int = PERIOD) -> NDArray[np.float64]:
     """Energy (temporal bands, spatial bands) of the first frames of a turn: Haar in space, then in time."""
     number = haar_bands(light.lighting.resolution)[0]
-    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)[:, None]
+    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)
     frames = turning(light, DEGREES, FRAMES, max(period - FRAMES, 0))
     history = np.stack(
-        [haar_colours(texels * scale) for _, texels in zip(range(period), frames, strict=False)]
+        [haar_colours(texels, scale) for _, texels in zip(range(period), frames, strict=False)]
     )
     levels = pywt.wavedec(history, "haar", mode="periodization", axis=0)
     return np.stack(

@@ -22,7 +22,6 @@ from mi_sparse_prt.relighting.approximations import (
 from mi_sparse_prt.relighting.columns import wavelet_columns
 from mi_sparse_prt.relighting.light import TurningLight
 from mi_sparse_prt.relighting.players import ClusteredPlayer, ColumnsPlayer, Player
-from mi_sparse_prt.relighting.relighter import albedo_times
 from mi_sparse_prt.transport import LightTransport
 
 FRAMES, WARM = 120, 8  # measured, and those before them that compile and fill caches
@@ -89,19 +88,19 @@ def _measured(
     approximation: Approximation, playing: Player, budget: int | None, albedo: Floats, light: TurningLight
 ) -> Report:
     """Medians of the stages of frames, from light to colours of vertices."""
-    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)[:, None]
+    scale = np.sqrt(light.lighting.solid_angles, dtype=np.float32)
     stages = defaultdict(list)
     for frame in range(WARM + FRAMES):
         moments = [time.perf_counter()]
         texels = light.turned(90 * (frame / FRAMES) ** 2)
         moments.append(time.perf_counter())
-        coefficients = haar_colours(texels * scale)
+        coefficients = haar_colours(texels, scale)
         moments.append(time.perf_counter())
         update = approximation.update(coefficients, budget if frame else None)
         moments.append(time.perf_counter())
         playing.apply(update)
         moments.append(time.perf_counter())
-        albedo_times(albedo, playing.incident)
+        playing.radiance(albedo)
         moments.append(time.perf_counter())
         if frame >= WARM:
             for stage, seconds in zip(

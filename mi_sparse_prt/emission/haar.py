@@ -58,33 +58,45 @@ def haar_bands(n: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     return level, (n / 2.0**level).astype(np.float32)
 
 
-def haar_colours(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``haar`` of each column of (6 n^2, 3), in compiled code: for light that changes in every frame."""
+def haar_colours(
+    values: NDArray[np.float32], scale: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """``haar`` of each column of (6 n^2, 3), in compiled code: for light that changes in every frame.
+
+    Texels are multiplied by ``scale`` (6 n^2,) first.
+    """
     n = round((len(values) / 6) ** 0.5)
-    faces = np.array(values, np.float32).reshape(6, n, n, 3)
-    _transform(faces)
+    values = np.ascontiguousarray(values, np.float32)
+    factors = np.ones(len(values), np.float32) if scale is None else scale
+    faces = np.empty((6, n, n, 3), np.float32)
+    _transform(values.reshape(6, n, n, 3), factors.reshape(6, n, n), faces)
     return faces.reshape(-1, 3)
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _transform(faces: NDArray[np.float32]) -> None:
-    """Faces (6, n, n, 3) in place."""
+def _transform(values: NDArray[np.float32], scale: NDArray[np.float32], faces: NDArray[np.float32]) -> None:
+    """Faces (6, n, n, 3) of values times a scale."""
     n, half_of = faces.shape[1], np.float32(0.5)
     for f in numba.prange(6):
-        room, size = np.empty((n, n, 3), np.float32), n
+        own, size = np.empty((n, n, 3), np.float32), n
+        for i in range(n):
+            for j in range(n):
+                for c in range(3):
+                    own[i, j, c] = values[f, i, j, c] * scale[f, i, j]
         while size > 1:
             half = size // 2
             for i in range(half):
                 for j in range(half):
                     for c in range(3):
-                        a, b = faces[f, 2 * i, 2 * j, c], faces[f, 2 * i, 2 * j + 1, c]
-                        d, e = faces[f, 2 * i + 1, 2 * j, c], faces[f, 2 * i + 1, 2 * j + 1, c]
-                        room[i, j, c] = half_of * ((a + b) + (d + e))
-                        room[i, half + j, c] = half_of * ((a - b) + (d - e))
-                        room[half + i, j, c] = half_of * ((a + b) - (d + e))
-                        room[half + i, half + j, c] = half_of * ((a - b) - (d - e))
-            faces[f, :size, :size] = room[:size, :size]
+                        a, b = own[2 * i, 2 * j, c], own[2 * i, 2 * j + 1, c]
+                        d, e = own[2 * i + 1, 2 * j, c], own[2 * i + 1, 2 * j + 1, c]
+                        faces[f, i, half + j, c] = half_of * ((a - b) + (d - e))
+                        faces[f, half + i, j, c] = half_of * ((a + b) - (d + e))
+                        faces[f, half + i, half + j, c] = half_of * ((a - b) - (d - e))
+                        # what is overwritten is not needed any more: i and j are never above 2 i and 2 j
+                        own[i, j, c] = half_of * ((a + b) + (d + e))
             size = half
+        faces[f, 0, 0] = own[0, 0]
 
 
 def _faces(values: Floats) -> Floats:

@@ -129,7 +129,10 @@ class Approximation(ABC):
             raise PrtError(
                 f"light has shape {light.shape}; {self.name} was made for {self.applied.shape}: make another"
             )
-        if not np.isfinite(light.sum()) and not np.isfinite(light).all():
+        flat = light.ravel()
+        if (
+            not np.isfinite(flat @ flat) and not np.isfinite(light).all()
+        ):  # the first is quick, and may overflow
             raise PrtError("light has values that are NaN or infinite; this frame was left out")
         if budget is not None and budget < 0:
             raise PrtError(f"a budget of {budget} coefficients: give 0 or more, or None for all")
@@ -145,18 +148,16 @@ class Approximation(ABC):
         """Chosen coefficients become those of the light; no group is reset."""
         return self._set(light, chosen, np.zeros(self.groups, np.bool_))
 
-    def _set(self, light: Floats, chosen: Ints, resets: Flags) -> Update:
-        """Chosen coefficients become those of the light, after the resets."""
-        group = self.bands.number if self.groups > 1 else np.zeros(1, np.int64)
+    def _set(self, light: Floats, chosen: Ints, resets: Flags, counts: Ints | None = None) -> Update:
+        """Chosen coefficients become those of the light, after the resets; ``counts`` are those of groups, in order."""
+        if counts is None:
+            group = self.bands.number[chosen] if self.groups > 1 else np.zeros(len(chosen), np.int64)
+            chosen = chosen[np.argsort(group, kind="stable")]
+            counts = np.bincount(group, minlength=self.groups)
         if resets.any():
-            self.applied[resets[group] if self.groups > 1 else slice(None)] = 0
-        if self.groups > 1:
-            chosen = chosen[np.argsort(group[chosen], kind="stable")]
-            starts = np.searchsorted(group[chosen], np.arange(self.groups + 1))
-        else:
-            starts = np.array([0, len(chosen)])
-        changes = light[chosen] - self.applied[chosen]
-        self.applied[chosen] = light[chosen]
+            _zero(self.applied, self.bands.number, resets)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        changes = _replace(self.applied, light, chosen)
         return Update(chosen, changes, starts, resets, self.applied)
 
 
@@ -166,7 +167,7 @@ class NonIncremental(Approximation):
     name = "non_incremental"
 
     def _update(self, light: Floats, budget: int) -> Update:
-        chosen = _largest(_sizes(light, self.applied, self.bands.weights)[1], budget)
+        chosen = _largest(norms(light, self.bands.weights), budget)
         return self._set(light, chosen, np.ones(1, np.bool_))
 
 
@@ -176,7 +177,7 @@ class Incremental(Approximation):
     name = "incremental"
 
     def _update(self, light: Floats, budget: int) -> Update:
-        return self._incremental(light, _largest(_sizes(light, self.applied, self.bands.weights)[0], budget))
+        return self._incremental(light, _largest(norms(light - self.applied, self.bands.weights), budget))
 
 
 class PerBand(Approximation):
@@ -201,6 +202,7 @@ class PerBand(Approximation):
         self.exhaustive = exhaustive
         self._offsets = np.concatenate([[0], np.cumsum(np.bincount(bands.number))])
         self._order = np.argsort(bands.number, kind="stable")
+        self._sizes = np.empty((2, len(bands.number)), np.float32)  # by band
         super().__init__(bands)
 
     @property
@@ -212,18 +214,16 @@ class PerBand(Approximation):
         self.resets: Flags = np.zeros(self.bands.count, np.bool_)
 
     def _update(self, light: Floats, budget: int) -> Update:
-        differences, sizes = _sizes(light, self.applied, self.bands.weights)
-        both = np.stack([differences, sizes])[:, self._order]
-        totals = np.add.reduceat(both, self._offsets[:-1], axis=1, dtype=np.float64)  # [mode, band]
-        most = min(budget, both.shape[1])
-        if self.exhaustive and most > 0:
-            largest, places, lengths = _largest_of_bands(both, self._offsets, most)
+        _sizes(light, self.applied, self.bands.weights, self._order, self._sizes)
+        most = min(budget, self._sizes.shape[1])
+        largest, places, lengths, totals = _largest_of_bands(self._sizes, self._offsets, most)
+        if self.exhaustive:
             self.resets, counts = _best_combination(largest, lengths, totals, most)
-            chosen = [places[int(self.resets[b]), b, :k] for b, k in enumerate(counts)]
-            return self._set(light, self._order[np.concatenate(chosen)], self.resets)
-        self.resets = totals[0] > totals[1]
-        ours = np.where(self.resets[self.bands.number], sizes, differences)
-        return self._set(light, _largest(ours, budget), self.resets)
+        else:
+            self.resets = totals[0] > totals[1]
+            counts = _merged(largest, lengths, self.resets, most)
+        chosen = [places[int(self.resets[b]), b, :k] for b, k in enumerate(counts)]
+        return self._set(light, self._order[np.concatenate(chosen)], self.resets, counts)
 
 
 class Leading(Approximation):
@@ -244,33 +244,63 @@ class Everything(Approximation):
         return self._everything(light)
 
 
-def weighted_error(approximation: Approximation, light: Floats) -> float:
-    """How far L~ is from L, relative: the weighted L1 norm over coefficients ([OBRG06] Figure 7)."""
-    left, all_of_it = _sizes(
-        np.ascontiguousarray(light, np.float32), approximation.applied, approximation.bands.weights
-    )
-    return float(left.sum(dtype=np.float64) / max(all_of_it.sum(dtype=np.float64), 1e-30))
+def weighted_error(approximation: Approximation, light: Floats, bands: Bands | None = None) -> float:
+    """How far L~ is from L, relative: the weighted L1 norm over coefficients ([OBRG06] Figure 7).
+
+    ``bands`` have the weights, if these are not those by which the approximation chooses.
+    """
+    weights = (bands or approximation.bands).weights
+    left, whole = (norms(x, weights).sum(dtype=np.float64) for x in (light - approximation.applied, light))
+    return float(left / max(whole, 1e-30))
+
+
+@numba.njit(cache=True)
+def _zero(applied: Floats, number: Ints, resets: Flags) -> None:
+    """Set some groups to zero; with one group all."""
+    for j in range(len(applied)):
+        if resets[number[j] if len(resets) > 1 else 0]:
+            applied[j, 0] = applied[j, 1] = applied[j, 2] = 0
+
+
+@numba.njit(cache=True)
+def _replace(applied: Floats, light: Floats, chosen: Ints) -> Floats:
+    """Let some coefficients be those of the light; how they change, (k, 3)."""
+    changes = np.empty((len(chosen), 3), np.float32)
+    for k, j in enumerate(chosen):
+        for c in range(3):
+            changes[k, c] = light[j, c] - applied[j, c]
+            applied[j, c] = light[j, c]
+    return changes
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
-def _sizes(light: Floats, applied: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Weighted norms over channels of L - L~ and of L, (m,) each."""
-    m = len(light)
-    differences, sizes = np.empty(m, np.float32), np.empty(m, np.float32)
-    for j in numba.prange(m):
+def norms(light: Floats, weights: Floats) -> Floats:
+    """Weighted norms of colours (m, 3): (m,)."""
+    sizes = np.empty(len(light), np.float32)
+    for j in numba.prange(len(light)):
+        a, b, c = light[j, 0], light[j, 1], light[j, 2]
+        sizes[j] = weights[j] * np.sqrt(a * a + b * b + c * c)
+    return sizes
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _sizes(light: Floats, applied: Floats, weights: Floats, order: Ints, sizes: Floats) -> None:
+    """Weighted norms of L - L~ and of L (2, m), in an order."""
+    for k in numba.prange(len(order)):
+        j = order[k]
         a, b, c = light[j, 0], light[j, 1], light[j, 2]
         d, e, f = a - applied[j, 0], b - applied[j, 1], c - applied[j, 2]
-        sizes[j] = weights[j] * np.sqrt(a * a + b * b + c * c)
-        differences[j] = weights[j] * np.sqrt(d * d + e * e + f * f)
-    return differences, sizes
+        sizes[0, k] = weights[j] * np.sqrt(d * d + e * e + f * f)
+        sizes[1, k] = weights[j] * np.sqrt(a * a + b * b + c * c)
 
 
 def _largest(sizes: Floats, count: int) -> Ints:
-    """Places of so many of the largest values that are not 0, ascending."""
-    if count == 0:
-        return np.zeros(0, np.int64)
-    places = np.argpartition(sizes, -count)[-count:] if count < len(sizes) else np.arange(len(sizes))
-    return np.sort(places[sizes[places] > 0])
+    """Places of so many of the largest values that are not 0."""
+    if count > len(sizes) // 8:  # a heap would be slower than a sort
+        places = np.argsort(-sizes, kind="stable")[:count]
+        return places[sizes[places] > 0]
+    room, places = np.empty(count, np.float32), np.empty(count, np.int64)
+    return places[: _keep_largest(sizes, count, room, places)]
 
 
 @numba.njit(cache=True)
@@ -314,18 +344,43 @@ def _sink(sizes: Floats, places: Ints, value: np.float32, length: int) -> int:
 
 
 @numba.njit(parallel=True, cache=True)
-def _largest_of_bands(values: Floats, offsets: Ints, count: int) -> tuple[Floats, Ints, Ints]:
-    """The largest (2, bands, count) of both modes, descending, their places in these, and how many there are."""
+def _largest_of_bands(
+    values: Floats, offsets: Ints, count: int
+) -> tuple[Floats, Ints, Ints, NDArray[np.float64]]:
+    """The largest (2, bands, count) of both modes, descending, their places, how many there are, and sums of all."""
     bands = len(offsets) - 1
     sizes, places = np.zeros((2, bands, count), np.float32), np.zeros((2, bands, count), np.int64)
-    lengths = np.zeros((2, bands), np.int64)
+    lengths, totals = np.zeros((2, bands), np.int64), np.zeros((2, bands))
     for which in numba.prange(2 * bands):
-        mode, band = which % 2, bands - 1 - which // 2
-        first, last = offsets[band], offsets[band + 1]
-        length = _keep_largest(values[mode, first:last], count, sizes[mode, band], places[mode, band])
-        places[mode, band, :length] += first
+        mode, band = (
+            which // bands,
+            which % bands,
+        )  # a thread has all bands of a mode: the finest is most of the work
+        own = values[mode, offsets[band] : offsets[band + 1]]
+        length = _keep_largest(own, count, sizes[mode, band], places[mode, band])
+        places[mode, band, :length] += offsets[band]
         lengths[mode, band] = length
-    return sizes, places, lengths
+        total = 0.0
+        for value in own:
+            total += value
+        totals[mode, band] = total
+    return sizes, places, lengths, totals
+
+
+@numba.njit(cache=True)
+def _merged(sizes: Floats, lengths: Ints, resets: Flags, budget: int) -> Ints:
+    """How many of the largest coefficients each band gets, whose modes are given."""
+    counts = np.zeros(len(resets), np.int64)
+    for _ in range(budget):
+        largest, at = np.float32(0), -1
+        for b in range(len(resets)):
+            mode = int(resets[b])
+            if counts[b] < lengths[mode, b] and sizes[mode, b, counts[b]] > largest:
+                largest, at = sizes[mode, b, counts[b]], b
+        if at < 0:
+            break
+        counts[at] += 1
+    return counts
 
 
 @numba.njit(cache=True)
@@ -339,25 +394,18 @@ def _best_combination(
     """
     bands = lengths.shape[1]
     best, resets, counts = np.float64(np.inf), np.zeros(bands, np.bool_), np.zeros(bands, np.int64)
-    taken = np.zeros(bands, np.int64)
+    tried = np.zeros(bands, np.bool_)
     for combination in range(1 << bands):
+        for b in range(bands):
+            tried[b] = (combination >> (bands - 1 - b)) & 1
+        taken = _merged(sizes, lengths, tried, budget)
         left = np.float64(0)
         for b in range(bands):
-            taken[b] = 0
-            left += totals[(combination >> (bands - 1 - b)) & 1, b]
-        for _ in range(budget):
-            largest, at = np.float32(0), -1
-            for b in range(bands):
-                mode = (combination >> (bands - 1 - b)) & 1
-                if taken[b] < lengths[mode, b] and sizes[mode, b, taken[b]] > largest:
-                    largest, at = sizes[mode, b, taken[b]], b
-            if at < 0:
-                break
-            taken[at] += 1
-            left -= largest
+            mode = int(tried[b])
+            left += totals[mode, b]
+            for k in range(taken[b]):
+                left -= sizes[mode, b, k]
         if left < best * (1 - 1e-9):
             best = left
-            for b in range(bands):
-                resets[b] = (combination >> (bands - 1 - b)) & 1
-                counts[b] = taken[b]
+            resets[:], counts[:] = tried, taken
     return resets, counts

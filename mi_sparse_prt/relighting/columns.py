@@ -127,21 +127,14 @@ def add_columns(
     With one group there is no need for sums apart: they have no rows.
     """
     coefficients, changes, group_starts, resets = update
-    rows = len(total)
+    rows, apart = len(total), sums.shape[1] > 0
     for block in numba.prange(len(starts)):
         first, last = block * BLOCK, min((block + 1) * BLOCK, rows)
         here = total[first:last]
-        change = np.zeros_like(here) if sums.shape[1] else here
+        if not apart and resets[0]:
+            here[:] = 0
+        change = np.zeros_like(here) if apart else here
         for g in range(len(resets)):
-            own = sums[g, first:last] if sums.shape[1] else here
-            if resets[g]:
-                if sums.shape[1]:
-                    here -= own
-                own[:] = 0
-            if group_starts[g] == group_starts[g + 1]:
-                continue
-            if sums.shape[1]:
-                change[:] = 0
             for k in range(group_starts[g], group_starts[g + 1]):
                 j = coefficients[k]
                 _add_column(
@@ -151,9 +144,19 @@ def add_columns(
                     changes[k],
                     change,
                 )
-            if sums.shape[1]:
-                own += change
-                here += change
+            if apart and (resets[g] or group_starts[g] < group_starts[g + 1]):
+                _join(here, sums[g, first:last], change, resets[g])
+
+
+@numba.njit(fastmath=True, cache=True)
+def _join(here: Doubles, own: Doubles, change: Doubles, reset: bool) -> None:
+    """Add a change to a group's sum, or let it be that sum; and to that of all. The change is zero afterwards."""
+    for i in range(len(here)):
+        for c in range(3):
+            value = change[i, c] - own[i, c] if reset else change[i, c]
+            here[i, c] += value
+            own[i, c] += value
+            change[i, c] = 0
 
 
 @numba.njit(inline="always")

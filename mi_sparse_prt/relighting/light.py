@@ -53,13 +53,14 @@ class TurningLight:
         rotation : float or (3, 3) array
             Degrees about +y or a rotation matrix, as for ``Environment.rotated``.
         """
-        matrix = self.environment.rotated(rotation).rotation
-        if matrix[1, 1] > 1 - UPRIGHT and self.lighting.resolution > 1:
-            result = self._turntable.at(float(np.degrees(np.arctan2(matrix[0, 2], matrix[0, 0]))))
+        own, steep = self.environment.rotation, self.lighting.resolution == 1
+        if np.ndim(rotation) == 0 and np.isfinite(rotation) and _upright(own) and not steep:
+            result = self._turntable.at(_azimuth(own) + float(np.asarray(rotation)))
         else:
-            result = self._resampled(matrix)
-        found = result.T @ self.lighting.solid_angles
-        result *= (self._power / np.where(found > 0, found, 1)).astype(np.float32)
+            matrix = self.environment.rotated(rotation).rotation
+            about_up = _upright(matrix) and not steep
+            result = self._turntable.at(_azimuth(matrix)) if about_up else self._resampled(matrix)
+        _give_power(result, self.lighting.solid_angles, self._power)
         return result
 
     @cached_property
@@ -83,6 +84,16 @@ class TurningLight:
     def exact(self, rotation: ArrayLike) -> Floats:
         """L of the turned environment as ``CubemapLighting.project`` has it: for a light that stands still."""
         return self.lighting.project(self.environment.rotated(rotation))
+
+
+def _upright(matrix: NDArray[np.float64]) -> bool:
+    """Whether a rotation is about +y."""
+    return bool(matrix[1, 1] > 1 - UPRIGHT)
+
+
+def _azimuth(matrix: NDArray[np.float64]) -> float:
+    """Degrees of a rotation about +y."""
+    return float(np.degrees(np.arctan2(matrix[0, 2], matrix[0, 0])))
 
 
 def disc(lighting: CubemapLighting, towards: ArrayLike, degrees: float, radiance: ArrayLike = 1.0) -> Floats:
@@ -126,6 +137,23 @@ def _padded(texels: Floats, n: int) -> Floats:
     s_axis, t_axis, centre = (FACE_FRAMES[:, axis][:, None, None] for axis in range(3))
     directions = centre + places[None, None, :, None] * s_axis + places[None, :, None, None] * t_axis
     return texels[texels_towards(directions.reshape(-1, 3), n)].reshape(6, n + 2, n + 2, 3)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _give_power(light: Floats, areas: Floats, power: NDArray[np.float64]) -> None:
+    """Scale the channels of a light (m, 3) so that they have this power together."""
+    red = green = blue = 0.0
+    for j in numba.prange(len(light)):
+        red += areas[j] * light[j, 0]
+        green += areas[j] * light[j, 1]
+        blue += areas[j] * light[j, 2]
+    factors = np.ones(3, np.float32)
+    for c, found in enumerate((red, green, blue)):
+        if found > 0:
+            factors[c] = power[c] / found
+    for j in numba.prange(len(light)):
+        for c in range(3):
+            light[j, c] *= factors[c]
 
 
 @numba.njit(inline="always")

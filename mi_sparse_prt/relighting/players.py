@@ -40,14 +40,20 @@ class Player(ABC):
 
     Attributes
     ----------
-    incident : (rows, 3) float32
-        T L~: unit-albedo light of points, then of terms. Overwritten by the next frame.
     prepared_bytes : int
         What it keeps in memory beside the matrix: a converted matrix, and sums.
     """
 
     name: ClassVar[str]
-    incident: Floats
+
+    @property
+    @abstractmethod
+    def incident(self) -> Floats:
+        """T L~ (rows, 3): unit-albedo light of points, then of terms."""
+
+    def radiance(self, albedo: Floats) -> Floats:
+        """What leaves diffuse points of an albedo (rows, 3): (rows, 3)."""
+        return _times(albedo, self.incident)
 
     @abstractmethod
     def reset(self) -> None:
@@ -55,7 +61,7 @@ class Player(ABC):
 
     @abstractmethod
     def apply(self, update: Update) -> None:
-        """Bring ``incident`` up to date."""
+        """Bring the sums up to date."""
 
     @abstractmethod
     def column_norms(self) -> Floats | None:
@@ -97,18 +103,22 @@ class ProductPlayer(Player):
         self.reset()
 
     def reset(self) -> None:
-        self.incident = np.zeros((self._operator.shape[0], 3), np.float32)
+        self._incident = np.zeros((self._operator.shape[0], 3), np.float32)
+
+    @property
+    def incident(self) -> Floats:
+        return self._incident
 
     def apply(self, update: Update) -> None:
         texels = inverse_haar(update.applied.T).T / np.sqrt(self._lighting.solid_angles)[:, None]
-        self.incident = self._operator.relight(np.ascontiguousarray(texels, np.float32))
+        self._incident = self._operator.relight(np.ascontiguousarray(texels, np.float32))
 
     def column_norms(self) -> Floats | None:
         return None
 
     @property
     def prepared_bytes(self) -> int:
-        return self.incident.nbytes
+        return self._incident.nbytes
 
 
 class ColumnsPlayer(Player):
@@ -127,7 +137,10 @@ class ColumnsPlayer(Player):
         rows = len(self.columns.scales)
         self._total = np.zeros((rows, 3))
         self._sums = np.zeros((self._groups, rows if self._groups > 1 else 0, 3))
-        self.incident = np.zeros((rows, 3), np.float32)
+
+    @property
+    def incident(self) -> Floats:
+        return _times(self.columns.scales, self._total)
 
     def apply(self, update: Update) -> None:
         columns = self.columns
@@ -142,14 +155,13 @@ class ColumnsPlayer(Player):
             self._sums,
             self._total,
         )
-        np.multiply(self._total, columns.scales, out=self.incident, casting="same_kind")
 
     def column_norms(self) -> Floats | None:
         return self.columns.norms()
 
     @property
     def prepared_bytes(self) -> int:
-        return self.columns.nbytes + self._total.nbytes + self._sums.nbytes + self.incident.nbytes
+        return self.columns.nbytes + self._total.nbytes + self._sums.nbytes
 
 
 class ClusteredPlayer(Player):
@@ -194,8 +206,16 @@ class ClusteredPlayer(Player):
         self._sums = np.zeros((self._groups, 3, values))
         self._done = np.zeros((3, values))  # coefficients of clusters that rows show
         self._rows = np.zeros((3, rows), np.float32)  # by cluster
-        self.incident = np.zeros((rows, 3), np.float32)
         self._frame = 0
+
+    @property
+    def incident(self) -> Floats:
+        result = np.empty((len(self._order), 3), np.float32)
+        result[self._order] = self._rows.T
+        return result
+
+    def radiance(self, albedo: Floats) -> Floats:
+        return _in_order(self._rows, self._order, albedo)
 
     def apply(self, update: Update) -> None:
         parts = update.coefficients, update.changes, update.starts, update.resets
@@ -203,10 +223,9 @@ class ClusteredPlayer(Player):
         vectors = self.vectors if self._frame else self._count - 1  # the first frame is exact
         _add_to_rows(
             (coefficients, self._done, self._norms),
-            (self._weights, self._starts, self._order),
+            (self._weights, self._starts),
             (vectors, self._frame % REFRESH),
             self._rows,
-            self.incident,
         )
         self._frame += 1
 
@@ -222,7 +241,7 @@ class ClusteredPlayer(Player):
 
     @property
     def prepared_bytes(self) -> int:
-        kept = (self._columns, self._weights, self._order, self._sums, self._done, self._rows, self.incident)
+        kept = (self._columns, self._weights, self._order, self._sums, self._done, self._rows)
         return sum(array.nbytes for array in kept)
 
 
@@ -252,19 +271,18 @@ def _add_to_clusters(
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _add_to_rows(
     clusters: tuple[Doubles, Doubles, Doubles],
-    layout: tuple[Floats, Ints, Ints],
+    layout: tuple[Floats, Ints],
     frame: tuple[int, int],
     rows: Floats,
-    incident: Floats,
 ) -> None:
-    """Add to rows (3, n), by cluster, what coefficients of clusters changed; and list them in their own order.
+    """Add to rows (3, n), by cluster, what coefficients of clusters changed.
 
     ``clusters``: coefficients now and as the rows show them, both (3, values), and norms of weights (clusters, b).
-    ``layout``: weights (channels, b, n), where clusters start, and the order of rows. ``frame``: vectors to apply, and
-    the frame's number, which says which clusters are summed anew.
+    ``layout``: weights (channels, b, n) and where clusters start. ``frame``: vectors to apply, and the frame's number,
+    which says which clusters are summed anew.
     """
     now, done, norms = clusters
-    weights, starts, order = layout
+    weights, starts = layout
     vectors, turn = frame
     channels, b = weights.shape[:2]
     for c in numba.prange(len(starts) - 1):
@@ -273,35 +291,47 @@ def _add_to_rows(
         if anew:
             done[:, base : base + b + 1] = 0
             rows[:, first:last] = 0
+        sizes = np.empty(b)
+        for q in range(b):
+            square = 0.0
+            for colour in range(3):
+                square += (now[colour, base + 1 + q] - done[colour, base + 1 + q]) ** 2
+            sizes[q] = norms[c, q] * np.sqrt(square)
         for colour in range(3):
             change = np.float32(now[colour, base] - done[colour, base])
-            if change != 0:
-                done[colour, base] = now[colour, base]
-                for i in range(first, last):
-                    rows[colour, i] += change
-        chosen = _most_changed(now, done, norms[c], base, b if anew else vectors)
-        for q in chosen:
+            done[colour, base] = now[colour, base]
+            for i in range(first, last):
+                rows[colour, i] += change
+        for _ in range(b if anew else min(vectors, b)):
+            q = int(np.argmax(sizes))
+            if not sizes[q] > 0:
+                break
+            sizes[q] = 0
             for colour in range(3):
                 change = np.float32(now[colour, base + 1 + q] - done[colour, base + 1 + q])
                 done[colour, base + 1 + q] = now[colour, base + 1 + q]
                 weight, own = weights[colour % channels, q, first:last], rows[colour, first:last]
                 for i in range(len(own)):
                     own[i] += change * weight[i]
-        for i in range(first, last):
-            for colour in range(3):
-                incident[order[i], colour] = rows[colour, i]
 
 
-@numba.njit(inline="always")
-def _most_changed(now: Doubles, done: Doubles, norms: Doubles, base: int, count: int) -> Ints:
-    """Vectors of a cluster whose change matters most, so many at most; none that did not change."""
-    b = len(norms)
-    sizes = np.empty(b)
-    for q in range(b):
-        square = 0.0
-        for colour in range(3):
-            square += (now[colour, base + 1 + q] - done[colour, base + 1 + q]) ** 2
-        sizes[q] = norms[q] * np.sqrt(square)
-    order = np.argsort(-sizes) if count < b else np.arange(b)
-    chosen = order[: min(count, b)]
-    return chosen[sizes[chosen] > 0]
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _in_order(rows: Floats, order: Ints, albedo: Floats) -> Floats:
+    """Rows (3, n) that were sorted, times the albedo (n, 3), in the order of this: (n, 3)."""
+    result = np.empty((len(order), 3), np.float32)
+    for k in numba.prange(len(order)):
+        i = order[k]
+        for c in range(3):
+            result[i, c] = albedo[i, c] * rows[c, k]
+    return result
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _times(factors: Floats, values: NDArray[np.floating]) -> Floats:
+    """Products of (n, 1 or 3) and (n, 3)."""
+    result = np.empty(values.shape, np.float32)
+    channels = factors.shape[1]
+    for i in numba.prange(len(values)):
+        for c in range(3):
+            result[i, c] = factors[i, c % channels] * values[i, c]
+    return result

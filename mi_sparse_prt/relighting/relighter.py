@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -87,7 +86,7 @@ class Relighter:
         chosen = APPROXIMATIONS[approximation]
         bands = wavelet_bands(lighting.resolution, norms)
         self.approximation = PerBand(bands, by_image) if chosen is PerBand else chosen(bands)
-        self._scale = np.sqrt(lighting.solid_angles, dtype=np.float32)[:, None]
+        self._scale = np.sqrt(lighting.solid_angles, dtype=np.float32)
         self._started = False
 
     def reset(self) -> None:
@@ -128,7 +127,7 @@ class Relighter:
     def follow(self, light: Any) -> None:
         """Bring incident light up to date, without what leaves."""
         texels = self.transport.emission.project(light)
-        coefficients = haar_colours(texels * self._scale)
+        coefficients = haar_colours(texels, self._scale)
         update = self.approximation.update(coefficients, self.budget if self._started else None)
         self.player.apply(update)
         self._started = True
@@ -136,17 +135,6 @@ class Relighter:
     def colours(self, outgoing: ArrayLike | None = None) -> Floats:
         """What leaves the points under the light of the last frame: also for another view alone."""
         reflection, measurement = self.transport.reflection, self.transport.measurement
-        incident = self.player.incident
         if isinstance(reflection, Diffuse) and measurement.weights is None:
-            return albedo_times(reflection.albedo, incident)
-        return self.transport.leaving(incident, outgoing)
-
-
-@numba.njit(parallel=True, fastmath=True, cache=True)
-def albedo_times(albedo: Floats, incident: Floats) -> Floats:
-    """(n, 3) radiance of diffuse points."""
-    result = np.empty_like(incident)
-    for i in numba.prange(len(incident)):
-        for c in range(3):
-            result[i, c] = albedo[i, c] * incident[i, c]
-    return result
+            return self.player.radiance(reflection.albedo)
+        return self.transport.leaving(self.player.incident, outgoing)

@@ -1,9 +1,9 @@
 """Light of an environment that turns about its own axis: means of texels from sums along the rows of the image.
 
-Within a row of pixels a texel covers an interval of azimuths, and a turn moves all intervals alike. With the sums of each
-row from azimuth 0 on, what a texel gets from the row is one difference, of values that are linear within a pixel: exact
-in the turn. That the border of a texel may be slanted within a row is what is left out: each interval has the mean and
-the variance of the azimuths that the texel covers there.
+Within a row of pixels a texel covers an interval of azimuths, and a turn moves all intervals alike. With the sums of
+each row from azimuth 0 on, what a texel gets from the row is one difference, of values that are linear within a pixel:
+exact in the turn. That the border of a texel may be slanted within a row is what is left out: each interval has the
+mean and the variance of the azimuths that the texel covers there.
 """
 
 from __future__ import annotations
@@ -36,25 +36,30 @@ class Turntable:
 
     def __init__(self, pixels: NDArray[np.floating], lighting: CubemapLighting) -> None:
         self._height, self._width = pixels.shape[:2]
-        self._texels = lighting.n_directions
-        self._starts, self._rows, self._intervals = _intervals(
-            FACE_FRAMES, lighting.resolution, self._height, self._width, SQUARES
-        )
-        self._sums = np.zeros((self._height, 2 * self._width + 1, 3))  # twice around: intervals may cross azimuth 0
+        n, self._count = lighting.resolution, lighting.n_directions
+        texels, rows, intervals = _intervals(FACE_FRAMES, n, self._height, self._width, SQUARES)
+        # a row of sums stays in the cache for all texels of a face that meet it
+        face_rows = texels // (n * n) * self._height + rows
+        order = np.lexsort((intervals[:, 0], face_rows))
+        self._starts = np.searchsorted(face_rows[order], np.arange(6 * self._height + 1))
+        self._texels, self._intervals = texels[order].astype(np.int32), intervals[order].astype(np.float32)
+        self._sums = np.zeros(
+            (self._height, 2 * self._width + 1, 3)
+        )  # twice around: intervals may cross azimuth 0
         np.cumsum(np.tile(pixels, (1, 2, 1)), axis=1, dtype=np.float64, out=self._sums[:, 1:])
 
     def at(self, degrees: float) -> Floats:
         """L (6 n^2, 3) of the image turned so far about +y, as ``Environment.rotated``."""
-        result = np.empty((self._texels, 3), np.float32)
+        result = np.zeros((self._count, 3), np.float32)
         shift = float(degrees) % 360 * self._width / 360
-        _means(self._sums, self._starts, self._rows, self._intervals, shift, result)
+        _means(self._sums, self._starts, self._texels, self._intervals, shift, result)
         return result
 
 
 @numba.njit(parallel=True, cache=True)
-def _intervals(frames: Doubles, n: int, height: int, width: int, s: int) -> tuple[Ints, NDArray[np.int32], Doubles]:
-    """Rows that texels meet: where each texel's begin (6 n^2 + 1,), their numbers, and (k, 3) for each: first column
-    (azimuth in pixels), columns, and the share of the texel per column.
+def _intervals(frames: Doubles, n: int, height: int, width: int, s: int) -> tuple[Ints, Ints, Doubles]:
+    """Texels and rows that meet, (k,) each, and (k, 3): first column (azimuth in pixels), columns, and the share of
+    the texel per column.
     """
     texels = 6 * n * n
     most = 2 + int(2.0 * height / n)  # rows of a texel: it is less than 2 / n radians high
@@ -91,34 +96,36 @@ def _intervals(frames: Doubles, n: int, height: int, width: int, s: int) -> tupl
                 found[texel, k] = middle + mean - columns / 2, columns, sums[r, 0] / (whole * columns)
                 counts[texel + 1] += 1
     starts = np.cumsum(counts)
-    listed, intervals = np.empty(starts[-1], np.int32), np.empty((starts[-1], 3))
+    which, listed, intervals = (
+        np.empty(starts[-1], np.int64),
+        np.empty(starts[-1], np.int64),
+        np.empty((starts[-1], 3)),
+    )
     for texel in numba.prange(texels):
         first, last = starts[texel], starts[texel + 1]
+        which[first:last] = texel
         listed[first:last] = rows[texel, : last - first]
         intervals[first:last] = found[texel, : last - first]
-    return starts, listed, intervals
+    return which, listed, intervals
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _means(
-    sums: Doubles, starts: Ints, rows: NDArray[np.int32], intervals: Doubles, shift: float, result: Floats
+    sums: Doubles, starts: Ints, texels: NDArray[np.int32], intervals: Floats, shift: float, result: Floats
 ) -> None:
-    """Means of texels; ``shift`` is how far the image was turned, in pixels."""
-    width = (sums.shape[1] - 1) // 2
-    for texel in numba.prange(len(result)):
-        red = green = blue = 0.0
-        for e in range(starts[texel], starts[texel + 1]):
-            row = np.uint32(rows[e])
-            first = intervals[e, 0] + shift
-            first -= width * np.floor(first / width)
-            last, share = first + intervals[e, 1], intervals[e, 2]
-            # unsigned: a negative index would be counted from the end, which takes time to find out
-            i, j = np.uint32(first), np.uint32(last)
-            u, v, next_i, next_j = first - i, last - j, i + np.uint32(1), j + np.uint32(1)
-            a, b, c, d = share * (1 - v), share * v, -share * (1 - u), -share * u
-            red += a * sums[row, j, 0] + b * sums[row, next_j, 0] + c * sums[row, i, 0] + d * sums[row, next_i, 0]
-            green += (
-                a * sums[row, j, 1] + b * sums[row, next_j, 1] + c * sums[row, i, 1] + d * sums[row, next_i, 1]
-            )
-            blue += a * sums[row, j, 2] + b * sums[row, next_j, 2] + c * sums[row, i, 2] + d * sums[row, next_i, 2]
-        result[texel, 0], result[texel, 1], result[texel, 2] = red, green, blue
+    """Add to means of texels, face by face and row by row; ``shift`` is how far the image was turned, in pixels."""
+    height, width = len(sums), (sums.shape[1] - 1) // 2
+    for face in numba.prange(6):
+        for row in range(height):
+            own = sums[row]
+            for e in range(starts[face * height + row], starts[face * height + row + 1]):
+                first = np.float64(intervals[e, 0]) + shift
+                first -= width * np.floor(first / width)
+                last, share = first + intervals[e, 1], intervals[e, 2]
+                # unsigned: a negative index would be counted from the end, which takes time to find out
+                i, j, texel = np.uint32(first), np.uint32(last), np.uint32(texels[e])
+                u, v, next_i, next_j = first - i, last - j, i + np.uint32(1), j + np.uint32(1)
+                for c in range(3):
+                    upper = own[j, c] + v * (own[next_j, c] - own[j, c])
+                    lower = own[i, c] + u * (own[next_i, c] - own[i, c])
+                    result[texel, c] += np.float32(share * (upper - lower))

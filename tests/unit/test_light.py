@@ -50,6 +50,23 @@ def test_own_rotation_of_the_environment_counts():
     assert_array_equal(light.exact(20), exact)
 
 
+def test_a_turn_that_is_none_is_refused():
+    light = TurningLight(smooth_sky(), LIGHTING)
+    for wrong in (np.nan, np.inf, np.diag([1.0, -1.0, 1.0])):
+        with pytest.raises(prt.PrtError, match="rotation"):
+            light.turned(wrong)
+
+
+def test_turns_about_up_move_the_image_smoothly():
+    """An image of columns, where texels get intervals of it; looked up at four places each, it is 6% off."""
+    columns = np.random.default_rng(0).random((1, 90, 3)) ** 4
+    environment = Environment(np.repeat(columns, 45, axis=0))
+    light = TurningLight(environment, LIGHTING)
+    for degrees in (0, 13.7, 90, 200.1, -75):
+        ours, exact = light.turned(degrees), light.exact(degrees)
+        assert (AREAS * np.abs(ours - exact)).sum() < 0.02 * (AREAS * exact).sum()
+
+
 def test_black_light_stays_black():
     assert not TurningLight(Environment(np.zeros((8, 16, 3))), LIGHTING).turned(10).any()
 
