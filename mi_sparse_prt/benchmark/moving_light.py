@@ -77,8 +77,8 @@ METHODS = {
     "PBI(30) by band": _Method(lambda bands: PerBand(bands, exhaustive=False), 30),
     "PBI(30)": _Method(PerBand, 30),
     "PBI(100)": _Method(PerBand, 100),
-    "by image(30)": _Method(PerBand, 30, by_image=True),
-    "by image(100)": _Method(PerBand, 100, by_image=True),
+    "by image(30)": _Method(lambda bands: PerBand(bands, power=2), 30, by_image=True),
+    "by image(100)": _Method(lambda bands: PerBand(bands, power=2), 100, by_image=True),
 }
 
 

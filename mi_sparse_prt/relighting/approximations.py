@@ -188,7 +188,9 @@ class PerBand(Approximation):
     bands : Bands
     exhaustive : bool
         Try every combination of bands (5.2.1); else a band starts anew if the light is nearer to 0 than to what was
-        applied (5.2.2), by the L1 norm.
+        applied (5.2.2).
+    power : int
+        Of the weighted norms whose sum tells which is nearer: 1, as the paper has it, or 2.
 
     Attributes
     ----------
@@ -198,8 +200,8 @@ class PerBand(Approximation):
 
     name = "per_band"
 
-    def __init__(self, bands: Bands, exhaustive: bool = True) -> None:
-        self.exhaustive = exhaustive
+    def __init__(self, bands: Bands, exhaustive: bool = True, power: int = 1) -> None:
+        self.exhaustive, self.power = exhaustive, power
         self._offsets = np.concatenate([[0], np.cumsum(np.bincount(bands.number))])
         self._order = np.argsort(bands.number, kind="stable")
         self._sizes = np.empty((2, len(bands.number)), np.float32)  # by band
@@ -216,9 +218,9 @@ class PerBand(Approximation):
     def _update(self, light: Floats, budget: int) -> Update:
         _sizes(light, self.applied, self.bands.weights, self._order, self._sizes)
         most = min(budget, self._sizes.shape[1])
-        largest, places, lengths, totals = _largest_of_bands(self._sizes, self._offsets, most)
+        largest, places, lengths, totals = _largest_of_bands(self._sizes, self._offsets, most, self.power)
         if self.exhaustive:
-            self.resets, counts = _best_combination(largest, lengths, totals, most)
+            self.resets, counts = _best_combination(largest**self.power, lengths, totals, most)
         else:
             self.resets = totals[0] > totals[1]
             counts = _merged(largest, lengths, self.resets, most)
@@ -345,9 +347,9 @@ def _sink(sizes: Floats, places: Ints, value: np.float32, length: int) -> int:
 
 @numba.njit(parallel=True, cache=True)
 def _largest_of_bands(
-    values: Floats, offsets: Ints, count: int
+    values: Floats, offsets: Ints, count: int, power: int
 ) -> tuple[Floats, Ints, Ints, NDArray[np.float64]]:
-    """The largest (2, bands, count) of both modes, descending, their places, how many there are, and sums of all."""
+    """The largest (2, bands, count) of both modes, descending, their places, how many there are, and sums of powers of all."""
     bands = len(offsets) - 1
     sizes, places = np.zeros((2, bands, count), np.float32), np.zeros((2, bands, count), np.int64)
     lengths, totals = np.zeros((2, bands), np.int64), np.zeros((2, bands))
@@ -362,7 +364,7 @@ def _largest_of_bands(
         lengths[mode, band] = length
         total = 0.0
         for value in own:
-            total += value
+            total += value if power == 1 else value * value
         totals[mode, band] = total
     return sizes, places, lengths, totals
 

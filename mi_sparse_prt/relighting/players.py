@@ -172,8 +172,9 @@ class ClusteredPlayer(Player):
     operator : Clustered
     groups : int
     vectors : int, optional
-        Basis vectors of each cluster that are applied in a frame: those whose coefficients changed most, times the norm
-        of their weights. What is left out is applied later. All if not given, and in the first frame.
+        Basis vectors that are applied in a frame, for each cluster on average: those whose coefficients changed most,
+        times the norm of their weights, wherever they are. What is left out is applied later. All if not given, and in
+        the first frame.
     """
 
     name = "clustered"
@@ -220,14 +221,21 @@ class ClusteredPlayer(Player):
     def apply(self, update: Update) -> None:
         parts = update.coefficients, update.changes, update.starts, update.resets
         coefficients = _add_to_clusters(self._columns, parts, self._sums)
-        vectors = self.vectors if self._frame else self._count - 1  # the first frame is exact
+        changes = _changes(coefficients, self._done, self._norms)
         _add_to_rows(
-            (coefficients, self._done, self._norms),
+            (coefficients, self._done, changes),
             (self._weights, self._starts),
-            (vectors, self._frame % REFRESH),
+            (self._least(changes), self._frame % REFRESH),
             self._rows,
         )
         self._frame += 1
+
+    def _least(self, changes: Doubles) -> float:
+        """Changes from here on are applied; the first frame is exact."""
+        left = changes.size - self.vectors * len(changes)
+        if left <= 0 or self._frame == 0:
+            return 0.0
+        return float(np.partition(changes.ravel(), left)[left])
 
     def column_norms(self) -> Floats | None:
         """From the clusters' Gram matrices of weights: the norms of what a coefficient adds to their rows."""
@@ -268,22 +276,36 @@ def _add_to_clusters(
     return total
 
 
+@numba.njit(cache=True)
+def _changes(now: Doubles, done: Doubles, norms: Doubles) -> Doubles:
+    """How much it matters that coefficients of vectors changed, (clusters, b)."""
+    clusters, b = norms.shape
+    sizes = np.empty((clusters, b))
+    for c in range(clusters):
+        for q in range(b):
+            square, at = 0.0, c * (b + 1) + 1 + q
+            for colour in range(3):
+                square += (now[colour, at] - done[colour, at]) ** 2
+            sizes[c, q] = norms[c, q] * np.sqrt(square)
+    return sizes
+
+
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _add_to_rows(
     clusters: tuple[Doubles, Doubles, Doubles],
     layout: tuple[Floats, Ints],
-    frame: tuple[int, int],
+    frame: tuple[float, int],
     rows: Floats,
 ) -> None:
     """Add to rows (3, n), by cluster, what coefficients of clusters changed.
 
-    ``clusters``: coefficients now and as the rows show them, both (3, values), and norms of weights (clusters, b).
-    ``layout``: weights (channels, b, n) and where clusters start. ``frame``: vectors to apply, and the frame's number,
-    which says which clusters are summed anew.
+    ``clusters``: coefficients now and as the rows show them, both (3, values), and how much their changes matter
+    (clusters, b). ``layout``: weights (channels, b, n) and where clusters start. ``frame``: the least change that is
+    applied, and the frame's number, which says which clusters are summed anew.
     """
-    now, done, norms = clusters
+    now, done, changes = clusters
     weights, starts = layout
-    vectors, turn = frame
+    least, turn = frame
     channels, b = weights.shape[:2]
     for c in numba.prange(len(starts) - 1):
         first, last, base = starts[c], starts[c + 1], c * (b + 1)
@@ -291,22 +313,14 @@ def _add_to_rows(
         if anew:
             done[:, base : base + b + 1] = 0
             rows[:, first:last] = 0
-        sizes = np.empty(b)
-        for q in range(b):
-            square = 0.0
-            for colour in range(3):
-                square += (now[colour, base + 1 + q] - done[colour, base + 1 + q]) ** 2
-            sizes[q] = norms[c, q] * np.sqrt(square)
         for colour in range(3):
             change = np.float32(now[colour, base] - done[colour, base])
             done[colour, base] = now[colour, base]
             for i in range(first, last):
                 rows[colour, i] += change
-        for _ in range(b if anew else min(vectors, b)):
-            q = int(np.argmax(sizes))
-            if not sizes[q] > 0:
-                break
-            sizes[q] = 0
+        for q in range(b):
+            if not anew and (changes[c, q] < least or changes[c, q] == 0):
+                continue
             for colour in range(3):
                 change = np.float32(now[colour, base + 1 + q] - done[colour, base + 1 + q])
                 done[colour, base + 1 + q] = now[colour, base + 1 + q]

@@ -85,7 +85,7 @@ class Relighter:
         norms = self.player.column_norms() if by_image else None
         chosen = APPROXIMATIONS[approximation]
         bands = wavelet_bands(lighting.resolution, norms)
-        self.approximation = PerBand(bands, by_image) if chosen is PerBand else chosen(bands)
+        self.approximation = PerBand(bands, by_image, 1 + by_image) if chosen is PerBand else chosen(bands)
         self._scale = np.sqrt(lighting.solid_angles, dtype=np.float32)
         self._started = False
 

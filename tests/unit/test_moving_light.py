@@ -245,16 +245,17 @@ def test_any_sequence_of_budgets(seed, rows, clusters, bases, channels, budgets)
 
 
 def test_some_vectors_a_frame_reach_all_of_them():
+    """The changes that matter most are applied first, in whichever clusters they are."""
     rng = np.random.default_rng(9)
-    operator = clustered(rng, bases=12)
+    operator = clustered(rng, clusters=5, bases=12)
     playing, method = ClusteredPlayer(operator, 1, vectors=3), Everything(wavelet_bands(4))
     playing.apply(method.update(wavelets_of(rng.random((M, 3))), None))
-    light = rng.random((M, 3))
-    errors = []
-    for _ in range(4):
+    light = rng.random((M, 3)).astype(np.float32)
+    truth, errors = operator.relight(light), []
+    for _ in range(5):
         playing.apply(method.update(wavelets_of(light), None))
-        errors.append(relative_l2(playing.incident, operator.relight(light.astype(np.float32))))
-    assert errors[-1] < 1e-6 < errors[2] < errors[1] < errors[0]
+        errors.append(relative_l2(playing.incident, truth))
+    assert errors[-1] < 2e-6 < errors[1] < errors[0]
 
 
 @pytest.mark.parametrize("channels", [1, 3])
