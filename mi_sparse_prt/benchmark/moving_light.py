@@ -190,7 +190,7 @@ class _Case:
             if 0 < k < self.turn:
                 playing.apply(update)
                 sphere.append(self._sphere_error(approximation.applied, self.texels[k]))
-                wrong = self.albedo * playing.incident - self.exact[k]
+                wrong = playing.radiance(self.albedo) - self.exact[k]
                 norm = np.linalg.norm(self.exact[k])
                 image.append(float(np.linalg.norm(wrong) / norm))
                 flicker.append(float(np.linalg.norm(wrong - before) / norm))
@@ -215,7 +215,7 @@ class _Case:
         images = []
         for coefficients in self.light[:frames]:
             playing.apply(approximation.update(coefficients, budget))
-            images.append(self.albedo * playing.incident)
+            images.append(playing.radiance(self.albedo))
         return images
 
     def _sphere_error(self, applied: Floats, texels: Floats) -> float:

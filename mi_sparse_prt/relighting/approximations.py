@@ -349,7 +349,7 @@ def _sink(sizes: Floats, places: Ints, value: np.float32, length: int) -> int:
 def _largest_of_bands(
     values: Floats, offsets: Ints, count: int, power: int
 ) -> tuple[Floats, Ints, Ints, NDArray[np.float64]]:
-    """The largest (2, bands, count) of both modes, descending, their places, how many there are, and sums of powers of all."""
+    """The largest (2, bands, count) of both modes, descending, their places, how many there are; sums of all powers."""
     bands = len(offsets) - 1
     sizes, places = np.zeros((2, bands, count), np.float32), np.zeros((2, bands, count), np.int64)
     lengths, totals = np.zeros((2, bands), np.int64), np.zeros((2, bands))

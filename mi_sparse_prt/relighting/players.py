@@ -32,6 +32,7 @@ Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 REFRESH = 128  # frames within which all clusters are summed anew
+MANY = 4  # a whole product is quicker than a sum of more columns than this part of all
 COEFFICIENTS = 512  # of clusters, that a thread works on at a time: they stay in its cache
 
 
@@ -219,8 +220,7 @@ class ClusteredPlayer(Player):
         return _in_order(self._rows, self._order, albedo)
 
     def apply(self, update: Update) -> None:
-        parts = update.coefficients, update.changes, update.starts, update.resets
-        coefficients = _add_to_clusters(self._columns, parts, self._sums)
+        coefficients = self._clusters(update)
         changes = _changes(coefficients, self._done, self._norms)
         _add_to_rows(
             (coefficients, self._done, changes),
@@ -229,6 +229,14 @@ class ClusteredPlayer(Player):
             self._rows,
         )
         self._frame += 1
+
+    def _clusters(self, update: Update) -> Doubles:
+        """Coefficients of clusters (3, values) after an update."""
+        if self._groups == 1 and len(update.coefficients) > len(self._columns) // MANY:
+            self._sums[0] = update.applied.T @ self._columns
+            return self._sums[0]
+        parts = update.coefficients, update.changes, update.starts, update.resets
+        return _add_to_clusters(self._columns, parts, self._sums)
 
     def _least(self, changes: Doubles) -> float:
         """Changes from here on are applied; the first frame is exact."""

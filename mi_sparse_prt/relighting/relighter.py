@@ -115,13 +115,12 @@ class Relighter:
         PrtError
             If the light is not finite or has another shape: nothing changed then.
         """
-        start = time.perf_counter()
+        start, first = time.perf_counter(), not self._started
         self.follow(light)
         colours = self.colours(outgoing)
-        if self.rate is not None and self.budget is not None and self._started:
+        if self.rate is not None and self.budget is not None and not first:
             slower = np.clip((time.perf_counter() - start) * self.rate, 0.8, 2)
             self.budget = int(np.clip(self.budget / slower, FEWEST, len(self._scale)))
-        self._started = True
         return colours
 
     def follow(self, light: Any) -> None:

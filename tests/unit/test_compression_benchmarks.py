@@ -65,10 +65,10 @@ def test_cpca(tmp_path) -> None:
     assert "ball" in printed(cpca_tables(report))
 
 
-def test_moving_light(tmp_path) -> None:
+def test_moving_light() -> None:
     """What holds for any turn: more wavelets are better, those that go on better than those that start anew."""
     scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(20, 8, (60,), target_error=0.2)
-    report = measure_moving_light(scene, prt.CubemapLighting(8), False, tmp_path, effort)
+    report = measure_moving_light(scene, prt.CubemapLighting(8), False, None, effort)
     json.dumps(report)
     assert report["turning"].keys() == {"sky", "sun"}
     for turns in report["turning"].values():
@@ -85,8 +85,6 @@ def test_moving_light(tmp_path) -> None:
     frames = report["frames"]
     assert frames["product"]["bytes"] == 4 * len(scene.positions) * 384
     assert all(way["per_second"] > 0 for way in frames.values() if "per_second" in way)
-    for name in ("lights", "coverage", "energy", "errors", "bands"):
-        assert np.ptp(matplotlib.image.imread(tmp_path / f"moving_{name}.png")) > 0.1
     assert "a quarter of the weights" in printed(moving_light_tables(report))
 
 

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark.moving_light_figures import coverage, spatio_temporal_energy
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.relighting.light import TurningLight, disc
 from mi_sparse_prt.relighting.sequences import cut, interpolation, moving_disc, turning
@@ -109,3 +110,16 @@ def test_sequences_move_and_stand_still():
     assert [frame is first for frame in cut(first, last, 2, 4)] == [True, True, False, False]
     discs = list(moving_disc(LIGHTING, frames=4, still=1))
     assert len(discs) == 5 and (discs[0] != discs[3]).any() and (discs[3] == discs[4]).all()
+
+
+def test_figures_of_a_turn():
+    """Coverage counts the wavelets that lie over a texel; slow bands of space have slow bands of time."""
+    light = TurningLight(smooth_sky(), prt.CubemapLighting(8))
+    first_of_band_1 = np.array([0, 2])  # a whole face, and its upper left quarter
+    picture = coverage(first_of_band_1, 8)
+    assert np.nansum(picture) == 64 + 16 and np.nanmax(picture) == 2
+    energy = spatio_temporal_energy(light, 64)
+    assert energy.shape == (7, 3)
+    assert_array_equal(np.argmax(energy, axis=0)[:1], [0])
+    slow = energy[:2].sum(axis=0) / energy.sum(axis=0)
+    assert slow[0] > 0.9 and slow[0] > slow[-1]
