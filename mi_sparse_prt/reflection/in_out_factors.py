@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid
-from mi_sparse_prt.reflection.frames import frames
 from mi_sparse_prt.reflection.reflection import Floats, Ids, Reflection
 
 
@@ -102,18 +102,21 @@ class InOutFactors(Reflection):
         (n, 3) float32
             0 below the surface.
         """
-        n, turn = len(self.albedo), frames(self.tangents, self.normals)
-        terms = np.zeros((n, self.terms, 3), np.float32)
-        terms[self.glossy] = incident[n:].reshape(-1, self.terms, 3)
+        n = len(self.albedo)
         radiance = self.albedo * incident[:n]
         for number, factors in enumerate(self.factors):
             own = np.flatnonzero(self.material == number)
-            local = np.einsum("nij,nj->ni", turn[own], outgoing[own])
-            g = factors.grid.interpolate(factors.outgoing, local)  # [term, channel, vertex]
-            lobes = np.broadcast_to(g, (len(g), 3, len(own)))
-            radiance[own] += np.einsum("kcn,nkc->nc", lobes, terms[own][:, : len(g)])
-        above = np.einsum("nd,nd->n", outgoing, self.normals) > 0
-        return np.where(above[:, None], radiance, 0).astype(np.float32)
+            _add_lobes(
+                radiance,
+                (own, n + np.searchsorted(self.glossy, own) * self.terms),
+                np.asarray(incident, np.float32),
+                (self.tangents, self.normals, np.asarray(outgoing, np.float32)),
+                factors.outgoing.reshape(
+                    *factors.outgoing.shape[:2], factors.grid.heights, factors.grid.azimuths
+                ),
+            )
+        _leave_above(radiance, self.normals, np.asarray(outgoing, np.float32))
+        return radiance
 
     def take(self, points: Ids) -> InOutFactors:
         names = ("albedo", "tangents", "normals", "material")
@@ -172,3 +175,54 @@ def _read_factors(number: int, known: dict[str, Any], arrays: dict[str, NDArray[
         raise ValueError(f"factors of BRDF {number} do not fit together")
     flags = bool(known["varying_diffuse"]), bool(known.get("followed", False))
     return BrdfFactors(grid, diffuse, incident, outgoing, *flags)
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _add_lobes(
+    radiance: Floats,
+    which: tuple[NDArray[np.int64], NDArray[np.int64]],
+    incident: Floats,
+    frame: tuple[Floats, Floats, Floats],
+    lobes: Floats,
+) -> None:
+    """Add to radiance (n, 3) what leaves some points by the terms of one BRDF.
+
+    ``which``: the points, and their first rows of terms in ``incident`` (rows, 3). ``frame``: tangents, normals and
+    outgoing directions of all points. ``lobes`` (terms, 1 or 3, heights, azimuths), looked up as by
+    ``DirectionGrid.interpolate``.
+    """
+    points, first_rows = which
+    tangents, normals, outgoing = frame
+    terms, channels, heights, azimuths = lobes.shape
+    for p in numba.prange(len(points)):
+        i = points[p]
+        tx, ty, tz = tangents[i]
+        nx, ny, nz = normals[i]
+        ox, oy, oz = outgoing[i]
+        z = nx * ox + ny * oy + nz * oz
+        if z <= 0:
+            continue
+        x = tx * ox + ty * oy + tz * oz
+        y = (ny * tz - nz * ty) * ox + (nz * tx - nx * tz) * oy + (nx * ty - ny * tx) * oz
+        theta = np.arccos(min(z, np.float32(1))) * (heights / (0.5 * np.pi)) - 0.5
+        phi = np.arctan2(y, x) * (azimuths / (2 * np.pi)) - 0.5
+        row, column = int(np.floor(theta)), int(np.floor(phi))
+        a, b = np.float32(theta - row), np.float32(phi - column)
+        upper, lower = max(row, 0), min(row + 1, heights - 1)
+        left, right = column % azimuths, (column + 1) % azimuths
+        for k in range(terms):
+            for c in range(3):
+                lobe = lobes[k, c % channels]
+                above = lobe[upper, left] + b * (lobe[upper, right] - lobe[upper, left])
+                below = lobe[lower, left] + b * (lobe[lower, right] - lobe[lower, left])
+                radiance[i, c] += (above + a * (below - above)) * incident[first_rows[p] + k, c]
+
+
+@numba.njit(parallel=True, fastmath=True, cache=True)
+def _leave_above(radiance: Floats, normals: Floats, outgoing: Floats) -> None:
+    """Let nothing leave points below their surface."""
+    for i in numba.prange(len(radiance)):
+        z = normals[i, 0] * outgoing[i, 0] + normals[i, 1] * outgoing[i, 1] + normals[i, 2] * outgoing[i, 2]
+        for c in range(3):
+            if z <= 0:
+                radiance[i, c] = 0

@@ -212,9 +212,7 @@ class ClusteredPlayer(Player):
 
     @property
     def incident(self) -> Floats:
-        result = np.empty((len(self._order), 3), np.float32)
-        result[self._order] = self._rows.T
-        return result
+        return _in_order(self._rows, self._order, np.ones((len(self._order), 1), np.float32))
 
     def radiance(self, albedo: Floats) -> Floats:
         return _in_order(self._rows, self._order, albedo)
@@ -339,12 +337,12 @@ def _add_to_rows(
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _in_order(rows: Floats, order: Ints, albedo: Floats) -> Floats:
-    """Rows (3, n) that were sorted, times the albedo (n, 3), in the order of this: (n, 3)."""
-    result = np.empty((len(order), 3), np.float32)
+    """Rows (3, n) that were sorted, times the albedo (n, 1 or 3), in the order of this: (n, 3)."""
+    result, channels = np.empty((len(order), 3), np.float32), albedo.shape[1]
     for k in numba.prange(len(order)):
         i = order[k]
         for c in range(3):
-            result[i, c] = albedo[i, c] * rows[c, k]
+            result[i, c] = albedo[i, c % channels] * rows[c, k]
     return result
 
 
