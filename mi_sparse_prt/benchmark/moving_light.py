@@ -30,6 +30,7 @@ from mi_sparse_prt.relighting.approximations import (
     wavelet_bands,
     weighted_error,
 )
+from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
 from mi_sparse_prt.relighting.light import TurningLight
 from mi_sparse_prt.relighting.players import ClusteredPlayer
 from mi_sparse_prt.relighting.sequences import turning
@@ -113,9 +114,8 @@ def measure_moving_light(
     """
     transport = precompute(scene, lighting, target_error=effort.target_error, progress=progress)
     compressed = compress(transport, progress=progress)
-    operator = compressed.operators["compressed"]
-    assert hasattr(operator, "bases")
-    norms = ClusteredPlayer(operator).column_norms()  # type: ignore[arg-type]
+    clusters = cluster_columns(compressed.operators["compressed"])  # type: ignore[arg-type]
+    norms = clusters.norms()
     lights = {name: TurningLight(light, lighting) for name, light in environments_of(scene).items()}
     report: Report = report_header(scene, lighting) | {
         "matrix": {
@@ -128,9 +128,9 @@ def measure_moving_light(
     cases = [(name, degrees) for name in lights for degrees in effort.degrees]
     for name, degrees in tqdm(cases, desc="moving light", unit=" turns", disable=not progress):
         frames = list(turning(lights[name], degrees, effort.frames, effort.still))
-        case = _Case(frames, compressed, lighting, norms, effort.frames)
+        case = _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames)
         report["turning"].setdefault(name, {})[f"{degrees:g}"] = case.measured()
-    report["frames"] = measure_frames(transport, compressed, next(iter(lights.values())), progress)
+    report["frames"] = measure_frames(transport, compressed, clusters, next(iter(lights.values())), progress)
     if figures is not None:
         shown = "sunset" if "sunset" in lights else next(iter(lights))
         save_figures(figures, moving_light_figures(report, lights[shown], shown))
@@ -143,13 +143,14 @@ class _Case:
     def __init__(
         self,
         texels: list[Floats],
-        compressed: Any,
+        clusters: ClusterColumns,
+        albedo: Floats,
         lighting: CubemapLighting,
-        norms: Floats | None,
+        norms: Floats,
         turn: int,
     ) -> None:
         self.texels, self.lighting, self.norms, self.turn = texels, lighting, norms, turn
-        self.albedo, self.operator = compressed.albedo, compressed.operators["compressed"]
+        self.albedo, self.clusters = albedo, clusters
         self.scale = np.sqrt(lighting.solid_angles)[:, None]
         self.light: list[Floats] = []
         for k, values in enumerate(texels):
@@ -163,7 +164,7 @@ class _Case:
     def measured(self) -> Report:
         """All methods, what a quarter of the weights leaves out, and frames until the error is below others'."""
         methods = {label: self._played(method) for label, method in METHODS.items()}
-        quarter = -(-self.operator.bases.shape[1] // 4)
+        quarter = -(-self.clusters.sizes.shape[1] // 4)
         fewer = self._images(Everything(self.bands), None, self.turn, quarter)
         errors = [relative_l2(ours, exact) for ours, exact in zip(fewer, self.exact, strict=True)]
         result: Report = {"methods": methods, "vectors": {"mean": float(np.mean(errors[1:]))}}
@@ -180,7 +181,7 @@ class _Case:
         """One method: errors of light and image."""
         bands = wavelet_bands(self.lighting.resolution, self.norms) if method.by_image else self.bands
         approximation = method.make(bands)
-        playing = ClusteredPlayer(self.operator, approximation.groups)
+        playing = ClusteredPlayer(self.clusters, approximation.groups)
         light, sphere, image, flicker, resets = [], [], [], [], []
         before = np.zeros_like(self.albedo)
         for k, coefficients in enumerate(self.light):
@@ -211,7 +212,7 @@ class _Case:
         self, approximation: Approximation, budget: int | None, frames: int, vectors: int | None = None
     ) -> list[Floats]:
         """Colours of the vertices in the first frames."""
-        playing = ClusteredPlayer(self.operator, approximation.groups, vectors)
+        playing = ClusteredPlayer(self.clusters, approximation.groups, vectors)
         images = []
         for coefficients in self.light[:frames]:
             playing.apply(approximation.update(coefficients, budget))

@@ -19,6 +19,7 @@ from mi_sparse_prt.relighting.approximations import (
     PerBand,
     wavelet_bands,
 )
+from mi_sparse_prt.relighting.clusters import ClusterColumns
 from mi_sparse_prt.relighting.columns import wavelet_columns
 from mi_sparse_prt.relighting.light import TurningLight
 from mi_sparse_prt.relighting.players import ClusteredPlayer, ColumnsPlayer, Player
@@ -32,7 +33,11 @@ Floats = NDArray[np.float32]
 
 
 def measure_frames(
-    transport: LightTransport, compressed: LightTransport, light: TurningLight, progress: bool
+    transport: LightTransport,
+    compressed: LightTransport,
+    clusters: ClusterColumns,
+    light: TurningLight,
+    progress: bool,
 ) -> Report:
     """Times of frames of a turning light.
 
@@ -43,8 +48,7 @@ def measure_frames(
         ``prepared_bytes``. ``overhead``: time of PBI over that of NWA, without the light. ``product``: seconds of T L
         in float32 by BLAS (None if T does not fit into memory) and ratios to the products of clustered PCA.
     """
-    clusters = compressed.operators["compressed"]
-    quarter = -(-clusters.bases.shape[1] // 4)  # type: ignore[attr-defined]
+    quarter = -(-clusters.sizes.shape[1] // 4)
     bands = wavelet_bands(light.lighting.resolution)
     columns = wavelet_columns(compressed.incident, light.lighting)
 
@@ -55,7 +59,7 @@ def measure_frames(
         playing: Player = (
             ColumnsPlayer(columns, approximation.groups)
             if lists
-            else ClusteredPlayer(clusters, approximation.groups, vectors)  # type: ignore[arg-type]
+            else ClusteredPlayer(clusters, approximation.groups, vectors)
         )
         return _measured(approximation, playing, budget, compressed.albedo, light)
 

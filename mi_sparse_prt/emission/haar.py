@@ -73,6 +73,14 @@ def haar_colours(
     return faces.reshape(-1, 3)
 
 
+def haar_columns(values: Floats) -> NDArray[np.float32]:
+    """``haar`` of each column of (6 n^2, k): three at a time, a tenth of the time of ``haar`` for many columns."""
+    m, k = values.shape
+    padded = np.zeros((m, -(-k // 3) * 3), np.float32)
+    padded[:, :k] = values
+    return np.concatenate([haar_colours(padded[:, j : j + 3]) for j in range(0, k, 3)], axis=1)[:, :k]
+
+
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _transform(values: NDArray[np.float32], scale: NDArray[np.float32], faces: NDArray[np.float32]) -> None:
     """Faces (6, n, n, 3) of values times a scale."""

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.haar import haar, inverse_haar
+from mi_sparse_prt.emission.haar import inverse_haar
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.haar_rows import HaarRows
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.relighting.approximations import Update
+from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
 from mi_sparse_prt.relighting.columns import WaveletColumns, add_columns, wavelet_columns
 
 Floats = NDArray[np.float32]
@@ -88,7 +89,7 @@ def player(
         Basis vectors of each cluster whose weights are applied in a frame; all if not given.
     """
     if isinstance(operator, Clustered):
-        return ClusteredPlayer(operator, groups, vectors)
+        return ClusteredPlayer(cluster_columns(operator), groups, vectors)
     if isinstance(operator, HaarRows):
         return ColumnsPlayer(wavelet_columns(operator, lighting), groups)
     return ProductPlayer(operator, lighting)
@@ -170,7 +171,7 @@ class ClusteredPlayer(Player):
 
     Parameters
     ----------
-    operator : Clustered
+    clusters : ClusterColumns
     groups : int
     vectors : int, optional
         Basis vectors that are applied in a frame, for each cluster on average: those whose coefficients changed most,
@@ -180,31 +181,13 @@ class ClusteredPlayer(Player):
 
     name = "clustered"
 
-    def __init__(self, operator: Clustered, groups: int = 1, vectors: int | None = None) -> None:
-        self._groups = groups
-        clusters, count, m = operator.bases.shape
-        self._count = count + 1  # with the mean
-        self.vectors = count if vectors is None else vectors
-        self._columns = np.empty((m, clusters * self._count), np.float32)
-        for c in range(clusters):
-            affine = np.concatenate([operator.means[c][None], operator.bases[c]]).astype(np.float32)
-            self._columns[:, c * self._count : (c + 1) * self._count] = haar(affine).T
-        self._order = np.argsort(operator.labels, kind="stable").astype(np.int64)
-        self._starts = np.searchsorted(operator.labels[self._order], np.arange(clusters + 1))
-        # [channel, vector, row], rows by cluster: weights of a vector are read as runs
-        self._weights = np.ascontiguousarray(
-            np.moveaxis(operator.coefficients[self._order], 0, 2).astype(np.float32)
-        )
-        self._norms = np.stack(
-            [
-                np.sqrt(np.square(self._weights[:, :, a:b]).sum(axis=(0, 2)))
-                for a, b in zip(self._starts[:-1], self._starts[1:], strict=True)
-            ]
-        ).astype(np.float64)
+    def __init__(self, clusters: ClusterColumns, groups: int = 1, vectors: int | None = None) -> None:
+        self.clusters, self._groups = clusters, groups
+        self.vectors = clusters.sizes.shape[1] if vectors is None else vectors
         self.reset()
 
     def reset(self) -> None:
-        values, rows = self._columns.shape[1], len(self._order)
+        values, rows = self.clusters.columns.shape[1], len(self.clusters.order)
         self._sums = np.zeros((self._groups, 3, values))
         self._done = np.zeros((3, values))  # coefficients of clusters that rows show
         self._rows = np.zeros((3, rows), np.float32)  # by cluster
@@ -212,29 +195,30 @@ class ClusteredPlayer(Player):
 
     @property
     def incident(self) -> Floats:
-        return _in_order(self._rows, self._order, np.ones((len(self._order), 1), np.float32))
+        return self.radiance(np.ones((len(self.clusters.order), 1), np.float32))
 
     def radiance(self, albedo: Floats) -> Floats:
-        return _in_order(self._rows, self._order, albedo)
+        return _in_order(self._rows, self.clusters.order, albedo)
 
     def apply(self, update: Update) -> None:
-        coefficients = self._clusters(update)
-        changes = _changes(coefficients, self._done, self._norms)
+        coefficients = self._coefficients(update)
+        changes = _changes(coefficients, self._done, self.clusters.sizes)
         _add_to_rows(
             (coefficients, self._done, changes),
-            (self._weights, self._starts),
+            (self.clusters.weights, self.clusters.starts),
             (self._least(changes), self._frame % REFRESH),
             self._rows,
         )
         self._frame += 1
 
-    def _clusters(self, update: Update) -> Doubles:
+    def _coefficients(self, update: Update) -> Doubles:
         """Coefficients of clusters (3, values) after an update."""
-        if self._groups == 1 and len(update.coefficients) > len(self._columns) // MANY:
-            self._sums[0] = update.applied.T @ self._columns
+        columns = self.clusters.columns
+        if self._groups == 1 and len(update.coefficients) > len(columns) // MANY:
+            self._sums[0] = update.applied.T @ columns
             return self._sums[0]
         parts = update.coefficients, update.changes, update.starts, update.resets
-        return _add_to_clusters(self._columns, parts, self._sums)
+        return _add_to_clusters(columns, parts, self._sums)
 
     def _least(self, changes: Doubles) -> float:
         """Changes from here on are applied; the first frame is exact."""
@@ -244,19 +228,11 @@ class ClusteredPlayer(Player):
         return float(np.partition(changes.ravel(), left)[left])
 
     def column_norms(self) -> Floats | None:
-        """From the clusters' Gram matrices of weights: the norms of what a coefficient adds to their rows."""
-        squares = np.zeros(len(self._columns))
-        for c, (a, b) in enumerate(zip(self._starts[:-1], self._starts[1:], strict=True)):
-            own = self._columns[:, c * self._count : (c + 1) * self._count]
-            for weights in self._weights[:, :, a:b]:
-                affine = np.concatenate([np.ones((1, b - a), np.float32), weights])
-                squares += np.einsum("mp,pq,mq->m", own, affine @ affine.T, own, optimize=True)
-        return np.sqrt(np.maximum(squares, 0)).astype(np.float32)
+        return self.clusters.norms()
 
     @property
     def prepared_bytes(self) -> int:
-        kept = (self._columns, self._weights, self._order, self._sums, self._done, self._rows)
-        return sum(array.nbytes for array in kept)
+        return self.clusters.nbytes + sum(a.nbytes for a in (self._sums, self._done, self._rows))
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

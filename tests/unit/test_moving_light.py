@@ -26,6 +26,7 @@ from mi_sparse_prt.relighting.approximations import (
     wavelet_bands,
     weighted_error,
 )
+from mi_sparse_prt.relighting.clusters import cluster_columns
 from mi_sparse_prt.relighting.columns import wavelet_columns
 from mi_sparse_prt.relighting.players import ClusteredPlayer, ColumnsPlayer, ProductPlayer, player
 
@@ -248,7 +249,7 @@ def test_some_vectors_a_frame_reach_all_of_them():
     """The changes that matter most are applied first, in whichever clusters they are."""
     rng = np.random.default_rng(9)
     operator = clustered(rng, clusters=5, bases=12)
-    playing, method = ClusteredPlayer(operator, 1, vectors=3), Everything(wavelet_bands(4))
+    playing, method = ClusteredPlayer(cluster_columns(operator), 1, vectors=3), Everything(wavelet_bands(4))
     playing.apply(method.update(wavelets_of(rng.random((M, 3))), None))
     light = rng.random((M, 3)).astype(np.float32)
     truth, errors = operator.relight(light), []
@@ -286,7 +287,7 @@ def test_columns_of_any_operator_are_its_own():
 def test_norms_of_clusters_are_those_of_columns():
     operator = clustered(np.random.default_rng(13), channels=3)
     dense = haar(np.moveaxis(operator.rows(np.arange(70)), 2, 1) / np.sqrt(LIGHTING.solid_angles))
-    assert_allclose(ClusteredPlayer(operator).column_norms(), np.linalg.norm(dense, axis=(0, 1)), rtol=1e-3)
+    assert_allclose(cluster_columns(operator).norms(), np.linalg.norm(dense, axis=(0, 1)), rtol=1e-3)
     assert ProductPlayer(operator, LIGHTING).column_norms() is None
 
 
