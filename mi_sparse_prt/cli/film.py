@@ -133,39 +133,36 @@ def _names(frames: int) -> list[str]:
     return [f"{frame:0{digits}}.png" for frame in range(frames)]
 
 
+def new_frames(
+    command: Command, output: Path, frames: int, fps: float, exposure: float, folder: bool
+) -> Frames:
+    """A folder of pictures, or a film file, for so many frames."""
+    if folder:
+        return FrameFolder(command, output, frames, exposure)
+    return FilmFile(command, output, fps, exposure)
+
+
 def make_film(
-    command: Command,
-    images: Iterable[NDArray[np.float32]],
-    frames: int,
-    output: Path,
-    folder: bool,
-    fps: float,
-    exposure: float,
-    progress: bool,
-) -> dict[str, Any]:
+    command: Command, into: Frames, images: Iterable[NDArray[np.float32]], frames: int, progress: bool
+) -> int:
     """Write images (height, width, 3), linear RGB, one after the other.
 
     Parameters
     ----------
     command : Command
+    into : Frames
+        Where they go.
     images : iterable
         All of one size.
     frames : int
         How many images there are.
-    output : Path
-    folder : bool
-        Whether the output is a folder; else it is a film file.
-    fps : float
-        Frames per second, of a film file.
-    exposure : float
-        In stops; the same for all frames.
     progress : bool
         Show a progress bar.
 
     Returns
     -------
-    dict
-        What the report says of it.
+    int
+        Bytes of all that was written.
 
     Raises
     ------
@@ -174,11 +171,6 @@ def make_film(
     KeyboardInterrupt
         After Ctrl-C, when the frame that was begun and all before it are written.
     """
-    into: Frames
-    if folder:
-        into = FrameFolder(command, output, frames, exposure)
-    else:
-        into = FilmFile(command, output, fps, exposure)
     with command.patient_interrupts() as let_interrupt:
         try:
             bar = tqdm(images, "film", frames, unit=" frames", disable=not progress)
@@ -188,4 +180,4 @@ def make_film(
                 let_interrupt()
         finally:
             size = into.finish()
-    return {"path": str(output), "frames": frames, "bytes": size} | ({} if folder else {"fps": fps})
+    return size

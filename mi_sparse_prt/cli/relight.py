@@ -121,7 +121,7 @@ def relight(
     with running(json_file, quiet, outputs=[None if folder else output, vertices]) as command:
         # before the clock starts
         from mi_sparse_prt import load_environment, load_transport
-        from mi_sparse_prt.cli.film import check_frame_folder, make_film
+        from mi_sparse_prt.cli.film import check_frame_folder, make_film, new_frames
         from mi_sparse_prt.core.profiling import Stopwatch
         from mi_sparse_prt.relighting.film import film_lights
 
@@ -140,14 +140,17 @@ def relight(
             if last is not None:
                 report["to"] = last.report
             with clock.phase("render"):
+                into = new_frames(command, output, frames, fps, exposure, folder)
                 images = map(view.image, film_lights(light, last, rotate, frames))
-                report["film"] = make_film(command, images, frames, output, folder, fps, exposure, not quiet)
-            sizes = {output: report["film"]["bytes"]}
+                sizes = {output: make_film(command, into, images, frames, not quiet)}
+            report["film"] = {"path": str(output), "frames": frames, "bytes": sizes[output]}
+            report["film"] |= {} if folder else {"fps": fps}
         else:
             with command.prompt_interrupts():
-                files = _pictures(
-                    view, light.rotated(rotate), output, vertices, exposure, not quiet, clock, report
+                files, about = _pictures(
+                    view, light.rotated(rotate), output, vertices, exposure, not quiet, clock
                 )
+            report |= about
             for path, content in files.items():
                 command.write(path, content)
             sizes = {path: len(content) for path, content in files.items()}
@@ -164,12 +167,11 @@ def _pictures(
     exposure: float,
     progress: bool,
     clock: Stopwatch,
-    report: dict[str, Any],
-) -> dict[Path, bytes]:
+) -> tuple[dict[Path, bytes], dict[str, Any]]:
     """Contents of the files of one light, and what the report says of them."""
     from mi_sparse_prt.cli.files import image_bytes, vertices_bytes
 
-    files = {}
+    files, report = dict[Path, bytes](), dict[str, Any]()
     with clock.phase("relight"):
         radiance = view.transport.relight(light)  # [vertex, rgb]
     if vertices is not None:
@@ -180,7 +182,7 @@ def _pictures(
             image = view.image(light, progress)
         files[output] = image_bytes(image, output.suffix.lower(), exposure)
         report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
-    return files
+    return files, report
 
 
 def _check_pictures(output: Path | None, vertices: Path | None, to: Path | None) -> None:
