@@ -258,9 +258,9 @@ def _add_to_clusters(
     return total
 
 
-@numba.njit(cache=True)
+@numba.njit(fastmath=True, cache=True)
 def _changes(now: Doubles, done: Doubles, norms: Doubles) -> Doubles:
-    """How much it matters that coefficients of vectors changed, (clusters, b)."""
+    """How much it matters that coefficients of vectors changed, squared: (clusters, b)."""
     clusters, b = norms.shape
     sizes = np.empty((clusters, b))
     for c in range(clusters):
@@ -268,7 +268,7 @@ def _changes(now: Doubles, done: Doubles, norms: Doubles) -> Doubles:
             square, at = 0.0, c * (b + 1) + 1 + q
             for colour in range(3):
                 square += (now[colour, at] - done[colour, at]) ** 2
-            sizes[c, q] = norms[c, q] * np.sqrt(square)
+            sizes[c, q] = norms[c, q] * norms[c, q] * square
     return sizes
 
 

@@ -13,7 +13,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.compression.haar_truncation import haar_lists
 from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.haar import haar, haar_bands, haar_colours
+from mi_sparse_prt.emission.haar import haar, haar_bands, haar_colours, haar_columns
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.relighting.approximations import (
@@ -29,6 +29,7 @@ from mi_sparse_prt.relighting.approximations import (
 from mi_sparse_prt.relighting.clusters import cluster_columns
 from mi_sparse_prt.relighting.columns import wavelet_columns
 from mi_sparse_prt.relighting.players import ClusteredPlayer, ColumnsPlayer, ProductPlayer, player
+from mi_sparse_prt.relighting.sequences import moving_disc
 
 LIGHTING = CubemapLighting(4)
 M = LIGHTING.n_directions
@@ -150,6 +151,26 @@ def test_a_light_that_stands_still_is_reached_and_stays(name):
     assert_array_equal(method.applied, light)
     update = method.update(light, 10)
     assert len(update.coefficients) == 0 and not update.resets.any()
+
+
+@pytest.mark.parametrize("name", ["bi", "pbi"])
+def test_a_lamp_that_moves_is_exact_after_a_frame(name):
+    """As long as no more wavelets change than the budget allows ([OBRG06] 3)."""
+    lighting = CubemapLighting(16)
+    scale = np.sqrt(lighting.solid_angles)
+    method = METHODS[name](wavelet_bands(16))
+    frames = [haar_colours(x, scale) for x in moving_disc(lighting, degrees=(4, 6), frames=12)]
+    method.update(frames[0], None)
+    for before, light in itertools.pairwise(frames):
+        changed = np.count_nonzero((light != before).any(axis=1))
+        assert 0 < changed < 200
+        method.update(light, changed)
+        assert_array_equal(method.applied, light)
+
+
+def test_columns_are_transformed_like_rows():
+    values = np.random.default_rng(6).normal(size=(6 * 64, 7)).astype(np.float32)
+    assert_allclose(haar_columns(values), haar(values.T).T, atol=1e-5)
 
 
 def test_error_is_a_share_of_the_light():
