@@ -228,7 +228,6 @@ class LightTransport:
         if outgoing is None or not isinstance(self.reflection, InOutFactors):
             return self.measurement.combined(self.reflection.radiosity(incident))
         towards = np.broadcast_to(np.asarray(outgoing, np.float32), self.reflection.normals.shape)
-        towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         return self.measurement.combined(self.reflection.radiance(incident, towards))
 
     def coefficients(self, lighting: Any) -> Coefficients:

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid
 from mi_sparse_prt.reflection.reflection import Floats, Ids, Reflection
 
@@ -95,28 +96,37 @@ class InOutFactors(Reflection):
         incident : (rows, 3) float32
             Of all points.
         outgoing : (n, 3) float32, world
-            Unit vectors.
+            Of any length but 0.
 
         Returns
         -------
         (n, 3) float32
             0 below the surface.
         """
-        n = len(self.albedo)
-        radiance = self.albedo * incident[:n]
-        for number, factors in enumerate(self.factors):
-            own = np.flatnonzero(self.material == number)
+        radiance = self.albedo * incident[: len(self.albedo)]
+        # all read-only: the kernels are compiled once, whether arrays were computed or read
+        directions = read_only(np.ascontiguousarray(outgoing, np.float32))
+        normals, light = read_only(self.normals), read_only(np.ascontiguousarray(incident, np.float32))
+        for (points, rows), factors in zip(self._lit_rows, self.factors, strict=True):
+            grid = factors.grid
             _add_lobes(
                 radiance,
-                (own, n + np.searchsorted(self.glossy, own) * self.terms),
-                np.asarray(incident, np.float32),
-                (self.tangents, self.normals, np.asarray(outgoing, np.float32)),
-                factors.outgoing.reshape(
-                    *factors.outgoing.shape[:2], factors.grid.heights, factors.grid.azimuths
-                ),
+                (points, rows),
+                light,
+                (read_only(self.tangents), normals, directions),
+                read_only(factors.outgoing).reshape(*factors.outgoing.shape[:2], grid.heights, grid.azimuths),
             )
-        _leave_above(radiance, self.normals, np.asarray(outgoing, np.float32))
+        _leave_above(radiance, normals, directions)
         return radiance
+
+    @cached_property
+    def _lit_rows(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """For each BRDF its points, and their first rows of terms."""
+        found = []
+        for number in range(len(self.factors)):
+            points = np.flatnonzero(self.material == number)
+            found.append((points, len(self.albedo) + np.searchsorted(self.glossy, points) * self.terms))
+        return found
 
     def take(self, points: Ids) -> InOutFactors:
         names = ("albedo", "tangents", "normals", "material")
@@ -199,7 +209,8 @@ def _add_lobes(
         tx, ty, tz = tangents[i]
         nx, ny, nz = normals[i]
         ox, oy, oz = outgoing[i]
-        z = nx * ox + ny * oy + nz * oz
+        length = np.sqrt(ox * ox + oy * oy + oz * oz)
+        z = (nx * ox + ny * oy + nz * oz) / length
         if z <= 0:
             continue
         x = tx * ox + ty * oy + tz * oz
