@@ -43,7 +43,7 @@ Report = dict[str, Any]
 
 @dataclass(frozen=True)
 class MovingEffort:
-    """Which sequences are played ([OBRG06] Figures 2 to 4: a turn of 100 frames, 301 that stand still).
+    """Which sequences are played (turns of 100 frames as in [OBRG06] Figures 2 to 4, fewer that stand still).
 
     Attributes
     ----------
@@ -164,8 +164,7 @@ class _Case:
     def measured(self) -> Report:
         """All methods, what a quarter of the weights leaves out, and frames until the error is below others'."""
         methods = {label: self._played(method) for label, method in METHODS.items()}
-        quarter = -(-self.clusters.sizes.shape[1] // 4)
-        fewer = self._images(Everything(self.bands), None, self.turn, quarter)
+        fewer = self._images(Everything(self.bands), None, self.turn, self.clusters.quarter)
         errors = [relative_l2(ours, exact) for ours, exact in zip(fewer, self.exact, strict=True)]
         result: Report = {"methods": methods, "vectors": {"mean": float(np.mean(errors[1:]))}}
         result["stop"] = {

@@ -45,10 +45,9 @@ def measure_frames(
     -------
     dict
         For each way of playing: ``milliseconds`` of each stage (medians), their ``total``, ``per_second`` and
-        ``prepared_bytes``. ``overhead``: time of PBI over that of NWA, without the light. ``product``: seconds of T L
-        in float32 by BLAS (None if T does not fit into memory) and ratios to the products of clustered PCA.
+        ``prepared_bytes``. ``overhead``: time of PBI over that of NWA, without the light. ``product``: milliseconds of
+        T L in float32 by BLAS (None if T does not fit into memory), and ratios to the products of clustered PCA.
     """
-    quarter = -(-clusters.sizes.shape[1] // 4)
     bands = wavelet_bands(light.lighting.resolution)
     columns = wavelet_columns(compressed.incident, light.lighting)
 
@@ -71,7 +70,7 @@ def measure_frames(
         "clusters, PBI(100)": lambda: played(PerBand, 100),
         "clusters, PBI(30)": lambda: played(PerBand, 30),
         "clusters, PBI(1)": lambda: played(PerBand, 1),
-        "clusters, PBI(30), a quarter of the weights": lambda: played(PerBand, 30, quarter),
+        "clusters, PBI(30), a quarter of the weights": lambda: played(PerBand, 30, clusters.quarter),
         "columns, NWA(30)": lambda: played(NonIncremental, 30, lists=True),
         "columns, PBI(30)": lambda: played(PerBand, 30, lists=True),
     }

@@ -74,7 +74,7 @@ def haar_colours(
 
 
 def haar_columns(values: Floats) -> NDArray[np.float32]:
-    """``haar`` of each column of (6 n^2, k): three at a time, a tenth of the time of ``haar`` for many columns."""
+    """``haar`` of each column of (6 n^2, k): three at a time, in less than half the time of ``haar``."""
     m, k = values.shape
     padded = np.zeros((m, -(-k // 3) * 3), np.float32)
     padded[:, :k] = values

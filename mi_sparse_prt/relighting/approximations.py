@@ -7,7 +7,6 @@ budget of coefficients; it keeps L~, what has been applied so far, and says how 
 ``NonIncremental``     the largest coefficients of L, anew in every frame      NWA, [NRH03]
 ``Incremental``        the largest of L - L~                                   BI, equations 3 to 6
 ``PerBand``            of some bands one, of some the other                    PBI, Figure 6
-``Leading``            the first coefficients, always: spherical harmonics     section 7
 ``Everything``         all that changed
 =====================  ======================================================  =======================
 
@@ -130,9 +129,8 @@ class Approximation(ABC):
                 f"light has shape {light.shape}; {self.name} was made for {self.applied.shape}: make another"
             )
         flat = light.ravel()
-        if (
-            not np.isfinite(flat @ flat) and not np.isfinite(light).all()
-        ):  # the first is quick, and may overflow
+        # the first test is quick; squares of finite light may overflow
+        if not np.isfinite(flat @ flat) and not np.isfinite(light).all():
             raise PrtError("light has values that are NaN or infinite; this frame was left out")
         if budget is not None and budget < 0:
             raise PrtError(f"a budget of {budget} coefficients: give 0 or more, or None for all")
@@ -226,15 +224,6 @@ class PerBand(Approximation):
             counts = _merged(largest, lengths, self.resets, most)
         chosen = [places[int(self.resets[b]), b, :k] for b, k in enumerate(counts)]
         return self._set(light, self._order[np.concatenate(chosen)], self.resets, counts)
-
-
-class Leading(Approximation):
-    """The first coefficients of the basis, all of them in every frame: low-order spherical harmonics ([SKS02])."""
-
-    name = "leading"
-
-    def _update(self, light: Floats, budget: int) -> Update:
-        return self._set(light, np.arange(min(budget, len(light))), np.ones(1, np.bool_))
 
 
 class Everything(Approximation):
@@ -354,10 +343,8 @@ def _largest_of_bands(
     sizes, places = np.zeros((2, bands, count), np.float32), np.zeros((2, bands, count), np.int64)
     lengths, totals = np.zeros((2, bands), np.int64), np.zeros((2, bands))
     for which in numba.prange(2 * bands):
-        mode, band = (
-            which // bands,
-            which % bands,
-        )  # a thread has all bands of a mode: the finest is most of the work
+        # a thread has all bands of a mode: the finest is most of the work
+        mode, band = which // bands, which % bands
         own = values[mode, offsets[band] : offsets[band + 1]]
         length = _keep_largest(own, count, sizes[mode, band], places[mode, band])
         places[mode, band, :length] += offsets[band]

@@ -43,6 +43,11 @@ class ClusterColumns:
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.columns, self.weights, self.order, self.starts, self.sizes))
 
+    @property
+    def quarter(self) -> int:
+        """A quarter of the basis vectors of a cluster, rounded up: what a frame applies ([OBRG06] 6.3)."""
+        return -(-self.sizes.shape[1] // 4)
+
     def norms(self) -> Floats:
         """(m,) norms of what wavelets do to all rows, from the Gram matrices of the clusters' weights."""
         squares, count = np.zeros(len(self.columns)), self.sizes.shape[1] + 1

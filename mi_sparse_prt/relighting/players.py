@@ -86,10 +86,11 @@ def player(
     groups : int
         Of coefficients that are reset apart from each other (``Approximation.groups``).
     vectors : int, optional
-        Basis vectors of each cluster whose weights are applied in a frame; all if not given.
+        Basis vectors of each cluster whose weights are applied in a frame; a quarter of them if not given.
     """
     if isinstance(operator, Clustered):
-        return ClusteredPlayer(cluster_columns(operator), groups, vectors)
+        clusters = cluster_columns(operator)
+        return ClusteredPlayer(clusters, groups, clusters.quarter if vectors is None else vectors)
     if isinstance(operator, HaarRows):
         return ColumnsPlayer(wavelet_columns(operator, lighting), groups)
     return ProductPlayer(operator, lighting)

@@ -74,13 +74,13 @@ class Relighter:
             raise PrtError(f"approximation {approximation!r} is none of {', '.join(APPROXIMATIONS)}")
         if budget is not None and budget < 0:
             raise PrtError(f"a budget of {budget} wavelets: give 0 or more, or None for all")
+        if vectors is not None and vectors < 1:
+            raise PrtError(f"{vectors} basis vectors in a frame: give 1 or more")
         if rate is not None and not rate > 0:
             raise PrtError(f"{rate} frames per second: give a number above 0")
         self.transport, self.budget, self.rate = transport, budget, rate
         bands = wavelet_bands(lighting.resolution)
         groups = bands.count if approximation == PerBand.name else 1
-        if vectors is None and (compressed := transport.operators.get("compressed")) is not None:
-            vectors = -(-getattr(compressed, "bases", np.zeros((1, 0))).shape[1] // 4)
         self.player = player(transport.incident, lighting, groups, vectors)
         norms = self.player.column_norms() if by_image else None
         chosen = APPROXIMATIONS[approximation]
