@@ -75,6 +75,8 @@ def choose_variant(name: str | None = None) -> str:
         raise PrtError("variant cuda_ad_rgb: no CUDA driver or GPU found: use llvm_ad_rgb")
     if mi.variant() != name:
         mi.set_variant(name)
+    if name == "llvm_ad_rgb":
+        keep_gathers(Path(dr.__file__).parent / "libdrjit-core.so")
     # on one core Mitsuba waits for ever for a thread that reads and writes EXR files
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
@@ -91,6 +93,41 @@ def point_drjit_to_llvm() -> None:
     path = newest_llvm()
     if path is not None:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(path)
+
+
+def keep_gathers(drjit_core: Path) -> bool:
+    """Have LLVM compile a gather to one instruction, for which AVX2 processors have one, and not to a branch per lane.
+
+    LLVM takes it apart where the instruction is no faster (AMD Zen 1 to 3, Intel Haswell). Kernels run as fast either
+    way (Zen 3), but most of what they are made of is lookups, and compiling them takes three times as long in branches.
+
+    Dr.Jit lets its target be chosen in C++ alone. The functions are called by their C++ names, which have the types
+    of their arguments in them: where Dr.Jit has other ones, all stays as it is.
+
+    Parameters
+    ----------
+    drjit_core
+        Dr.Jit's library; the backend for LLVM must have been initialised.
+
+    Returns
+    -------
+    bool
+        Whether it was done: not for processors without AVX2, nor with AVX-512, for which LLVM keeps gathers.
+    """
+    if not drjit_core.exists():
+        return False
+    library = ctypes.CDLL(str(drjit_core))
+    try:
+        cpu, features = library._Z19jit_llvm_target_cpuv, library._Z24jit_llvm_target_featuresv
+        width, set_target = library._Z21jit_llvm_vector_widthv, library._Z19jit_llvm_set_targetPKcS0_j
+    except AttributeError:
+        return False
+    cpu.restype = features.restype = ctypes.c_char_p
+    enabled = features().split(b",")
+    if b"+avx2" not in enabled or b"+avx512f" in enabled or b"+fast-gather" in enabled:
+        return False
+    set_target(cpu(), b",".join([*enabled, b"+fast-gather"]), width())
+    return True
 
 
 def with_mitsuba(then: Callable[[], object]) -> None:

@@ -1,5 +1,6 @@
 """The choice of the variant: on stand-ins for Mitsuba and Dr.Jit, and for real in processes of their own."""
 
+import ctypes
 import importlib
 import os
 import subprocess
@@ -24,6 +25,7 @@ def machine(monkeypatch):
             variant=lambda: state.current, set_variant=lambda name: setattr(state, "current", name)
         )
         drjit = SimpleNamespace(
+            __file__="/nowhere/drjit/__init__.py",
             JitBackend=SimpleNamespace(CUDA="cuda", LLVM="llvm"),
             thread_count=lambda: 2,
             has_backend=lambda backend: cuda if backend == "cuda" else llvm is not None,
@@ -124,6 +126,26 @@ def test_the_chosen_llvm_compiles_the_kernel_that_aborts_old_ones():
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot give a process one core")
+def test_gathers_are_kept_where_llvm_takes_them_apart():
+    """A variant that was chosen has compiled with gathers ever since, on AVX2; nothing to do on other processors."""
+    import drjit as dr
+
+    core = Path(dr.__file__).parent / "libdrjit-core.so"
+    if not core.exists():
+        assert sys.platform != "linux"
+        return
+    library = ctypes.CDLL(str(core))
+    library._Z24jit_llvm_target_featuresv.restype = ctypes.c_char_p
+    features = library._Z24jit_llvm_target_featuresv().split(b",")
+    assert b"+avx2" not in features or b"+avx512f" in features or features.count(b"+fast-gather") == 1
+    assert not variant.keep_gathers(core)
+
+
+def test_a_drjit_with_other_functions_is_left_as_it_is():
+    assert not variant.keep_gathers(Path("libc.so.6"))
+    assert not variant.keep_gathers(Path(importlib.import_module("_ctypes").__file__))
+
+
 def test_environments_are_read_on_one_core(tmp_path):
     """
     Rationale: Mitsuba's OpenEXR waits for threads of Dr.Jit's pool, of which one core has none: it never returned.
