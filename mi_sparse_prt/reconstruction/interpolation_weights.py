@@ -74,17 +74,53 @@ def _weigh(
     if count == 0:
         return
     reach = max(np.float64(distances[count - 1]) / gaussians, 1e-30)
-    near = np.exp(-((distances[:count] / reach) ** 2))
-    near /= near.sum()
+    near, whole = np.empty(count), 0.0
+    for k in range(count):
+        near[k] = np.exp(-((distances[k] / reach) ** 2))
+        whole += near[k]
     terms = np.empty((count, 6))  # [neighbour, slope]
     for k in range(count):
+        near[k] /= whole
         for c in range(6):
             unit = max(reach / gaussians, 1e-30) if c < 3 else 1 / normal_unit
             terms[k, c] = (dense[ids[k], c] - point[c]) / unit
-    mean = near @ terms
-    weighted = (terms - mean) * near.reshape(-1, 1)
-    system = weighted.T @ (terms - mean) + ridge * np.eye(6)
-    weights[:count] = near - weighted @ np.linalg.solve(system, mean)
+    mean, system = np.zeros(6), np.zeros((6, 6))
+    for k in range(count):
+        for c in range(6):
+            mean[c] += near[k] * terms[k, c]
+    for a in range(6):
+        system[a, a] = ridge
+        for k in range(count):
+            terms[k, a] -= mean[a]
+        for b in range(a + 1):
+            for k in range(count):
+                system[a, b] += near[k] * terms[k, a] * terms[k, b]
+            system[b, a] = system[a, b]
+    _solve_positive(system, mean)
+    for k in range(count):
+        away = 0.0
+        for c in range(6):
+            away += terms[k, c] * mean[c]
+        weights[k] = near[k] * (1 - away)
+
+
+@numba.njit(cache=True)
+def _solve_positive(system: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+    """Solution, in place of the right side, of a positive definite system, which is eliminated: no pivots are needed.
+
+    NumPy's takes seconds to compile.
+    """
+    n = len(x)
+    for a in range(n):
+        for b in range(a + 1, n):
+            factor = system[b, a] / system[a, a]
+            for c in range(a, n):
+                system[b, c] -= factor * system[a, c]
+            x[b] -= factor * x[a]
+    for a in range(n - 1, -1, -1):
+        for c in range(a + 1, n):
+            x[a] -= system[a, c] * x[c]
+        x[a] /= system[a, a]
 
 
 def inverse_distance_weights(neighbours: Neighbours) -> NDArray[np.float32]:

@@ -47,6 +47,9 @@ Corner = tuple[
     Any, Any
 ]  # of the triangles that rays meet: vertices (UInt32), and their barycentric weights (Float)
 
+# of what leaves a hit: the coefficient of a vertex (irradiance / pi, or a term from 1 on), and how much of it (Color3f)
+Share = tuple[int, mi.UInt32, mi.Color3f]
+
 
 class RelitScene:
     """A scene with the light of one relighting on its vertices, ready to be looked at.
@@ -78,8 +81,8 @@ class RelitScene:
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self.max_depth, self.followed = max_depth, followed
-        self._goes_on = scene.specular or bool(followed)
-        self._irradiance = _of_depths(irradiance)
+        self.goes_on = scene.specular or bool(followed)
+        self._light = [_of_depths(irradiance)]  # irradiance / pi; coefficients of terms follow
         self._deepest, self._n_vertices = len(irradiance) - 1, scene.n_vertices
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
@@ -96,7 +99,7 @@ class RelitScene:
         A background that is seen is opaque. If it is hidden, it is so for rays that came straight from their origins.
         """
         shown = None if hide_background else self._background
-        if self._goes_on:
+        if self.goes_on:
             value, valid = follow(partial(self._seen, shown), ray, sampler, active, self.max_depth)
         else:
             found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), active, active)
@@ -161,6 +164,17 @@ class RelitScene:
             weights = self._hidden.weights(triangle, place, ray.d, weights, valid)
         return list(zip(vertices, weights, strict=True)), valid
 
+    def footprint(self, ray: mi.Ray3f, u: mi.Point2f) -> tuple[list[Share], mi.Mask, mi.Mask]:
+        """What rays see as sums over vertices, whatever the light; which of them see any, and which leave the scene.
+
+        For scenes without surfaces that rays go on from (``goes_on``).
+        """
+        hit = self._scene.ray_intersect_preliminary(ray)
+        si = hit.compute_surface_interaction(ray)
+        met = si.is_valid()
+        corners, lit = self._hit_corners(hit, si, ray, mi.Mask(met), met & (mi.Frame3f.cos_theta(si.wi) < 0))
+        return self._shares(si, corners, u, lit), lit, ~met
+
     def _shaded(
         self,
         si: mi.SurfaceInteraction3f,
@@ -173,27 +187,44 @@ class RelitScene:
 
         ``light`` is where light of as many surfaces as it may have met begins among that of all.
         """
-        irradiance = interpolated(self._irradiance, corners, valid, light)
+        shares = self._shares(si, corners, u, valid)
+        return sum(
+            (
+                weight * dr.gather(mi.Color3f, self._light[term], light + vertex, valid)
+                for term, vertex, weight in shares
+            ),
+            mi.Color3f(0),
+        )
+
+    def _shares(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> list[Share]:
+        """What leaves surfaces as a sum over the vertices around each hit."""
+        reflected = self._reflectance(si, corners, u, valid)
+        return [(0, vertex, weight * reflected) for vertex, weight in corners]
+
+    def _reflectance(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> mi.Color3f:
+        """Radiance that leaves surfaces for irradiance / pi of 1."""
         albedo = interpolated(self._albedo, corners, valid)
         bsdf = si.bsdf()
         flags = bsdf.flags()
         diffuse = ~mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Delta)
         reflected = dr.select(diffuse, bsdf.eval_diffuse_reflectance(si, valid), albedo)
-        if self._goes_on:
+        if self.goes_on:
             # a share of it is diffuse: what a random direction finds is that share, on average over all directions
             shared = mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
             out = mi.warp.square_to_cosine_hemisphere(u)
             out.z = dr.mulsign(out.z, mi.Frame3f.cos_theta(si.wi))
             value = bsdf.eval(mi.BSDFContext(), si, out, valid & shared)
             reflected = dr.select(shared, value * dr.pi / dr.maximum(dr.abs(out.z), 1e-6), reflected)
-        return irradiance * reflected
+        return reflected
 
 
-def interpolated(
-    values: mi.Color3f, corners: list[Corner], valid: mi.Mask, first: mi.UInt32 | int = 0
-) -> mi.Color3f:
-    """Values of vertices at points of triangles; those of vertex 0 come first, or at ``first``."""
-    return sum((w * dr.gather(mi.Color3f, values, first + i, valid) for i, w in corners), mi.Color3f(0))
+def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> mi.Color3f:
+    """Values of vertices at points of triangles."""
+    return sum((w * dr.gather(mi.Color3f, values, i, valid) for i, w in corners), mi.Color3f(0))
 
 
 def _of_depths(values: NDArray[np.float32]) -> mi.Color3f:
@@ -231,7 +262,7 @@ class GlossyRelitScene(RelitScene):
         irradiance = np.stack([some.unit_albedo for some in found])
         super().__init__(scene, irradiance, background, None, transport.max_depth, followed)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
-        self._terms = [
+        self._light += [
             _of_depths(np.stack([some.terms[:, k] for some in found])) for k in range(transport.terms)
         ]
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
@@ -249,36 +280,38 @@ class GlossyRelitScene(RelitScene):
         }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
 
-    def _shaded(
-        self,
-        si: mi.SurfaceInteraction3f,
-        corners: list[Corner],
-        light: mi.UInt32,
-        u: mi.Point2f,
-        valid: mi.Mask,
+    def _reflectance(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
     ) -> mi.Color3f:
-        glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
-        material = dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
+        glossy, material = self._glossy_at(corners, valid)
         diffuse = interpolated(self._diffuse, corners, glossy)
         for number, texture in self._textures.items():
             textured = glossy & (material == number)
             diffuse = dr.select(textured, mi.Color3f(texture.eval(si, textured)), diffuse)
-        total = dr.select(
-            glossy,
-            interpolated(self._irradiance, corners, glossy, light) * diffuse,
-            super()._shaded(si, corners, light, u, valid),
-        )
+        return dr.select(glossy, diffuse, super()._reflectance(si, corners, u, valid))
+
+    def _shares(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
+    ) -> list[Share]:
+        shares = super()._shares(si, corners, u, valid)
+        glossy, material = self._glossy_at(corners, valid)
         towards = si.to_world(si.wi)
         normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
+        terms = len(self._light) - 1
         for vertex, weight in corners:
             tangent = dr.gather(mi.Vector3f, self._tangents, vertex, glossy)
             s = dr.normalize(tangent - normal * dr.dot(normal, tangent))
             local = mi.Frame3f(s, dr.cross(normal, s), normal).to_local(towards)
-            lobes = [look_up(t, self._size, len(self._terms), material, local, glossy) for t in self._tables]
-            for k, values in enumerate(self._terms):
-                coefficient = weight * dr.gather(mi.Color3f, values, light + vertex, glossy)
-                total += dr.select(glossy, coefficient * mi.Color3f(*(lobe[k] for lobe in lobes)), 0)
-        return total
+            lobes = [look_up(t, self._size, terms, material, local, glossy) for t in self._tables]
+            for k in range(terms):
+                value = weight * mi.Color3f(*(lobe[k] for lobe in lobes))
+                shares.append((1 + k, vertex, dr.select(glossy, value, 0)))
+        return shares
+
+    def _glossy_at(self, corners: list[Corner], valid: mi.Mask) -> tuple[mi.Mask, mi.UInt32]:
+        """Which hits are on glossy surfaces, and of which material."""
+        glossy = valid & dr.gather(mi.Bool, self._glossy, corners[0][0], valid)
+        return glossy, dr.gather(mi.UInt32, self._material, corners[0][0], glossy)
 
 
 def _numbers(scene: Scene, surfaces: InOutFactors) -> list[int]:
@@ -358,7 +391,7 @@ def render(
     sensor = scene.sensor(sensor)
     transport = transport.for_scene(scene)
     check_camera(transport, sensor)
-    image = _rendered(scene, sensor, _relit_scene(scene, transport, environment), spp, seed, progress)
+    image = _rendered(scene, sensor, relit_scene(scene, transport, environment), spp, seed, progress)
     if transport.measurement.image is None:
         return image
     return image + transport.relight(environment).reshape(image.shape)
@@ -373,7 +406,7 @@ def check_camera(transport: LightTransport, sensor: mi.Sensor) -> None:
         )
 
 
-def _relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> RelitScene:
+def relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> RelitScene:
     """What a camera sees: of a matrix of pixels nothing but the lights themselves, of others the surfaces, too."""
     if transport.emission.kind != CubemapLighting.kind:
         background, lamps = None, (transport.lighting, transport.emission.project(environment))

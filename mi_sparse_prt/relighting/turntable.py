@@ -56,57 +56,69 @@ class Turntable:
         return result
 
 
-@numba.njit(parallel=True, cache=True)
 def _intervals(frames: Doubles, n: int, height: int, width: int, s: int) -> tuple[Ints, Ints, Doubles]:
     """Texels and rows that meet, (k,) each, and (k, 3): first column (azimuth in pixels), columns, and the share of
     the texel per column.
     """
-    texels = 6 * n * n
     most = 2 + int(2.0 * height / n)  # rows of a texel: it is less than 2 / n radians high
-    counts = np.zeros(texels + 1, np.int64)
-    rows, found = np.zeros((texels, most), np.int32), np.zeros((texels, most, 3))
-    for texel in numba.prange(texels):
-        sums = np.zeros((height, 3))  # weight, azimuth, its square
-        face, row, column = texel // (n * n), texel // n % n, texel % n
-        whole, middle = 0.0, 0.0
-        for p in range(-1, s * s):  # first the texel's centre
-            a = (row + 0.5) if p < 0 else (row + (p // s + 0.5) / s)
-            b = (column + 0.5) if p < 0 else (column + (p % s + 0.5) / s)
-            t, u = 2 * a / n - 1, 2 * b / n - 1
-            x = frames[face, 2, 0] + u * frames[face, 0, 0] + t * frames[face, 1, 0]
-            y = frames[face, 2, 1] + u * frames[face, 0, 1] + t * frames[face, 1, 1]
-            z = frames[face, 2, 2] + u * frames[face, 0, 2] + t * frames[face, 1, 2]
-            azimuth = np.arctan2(x, -z) * width / (2 * np.pi)
-            if p < 0:
-                middle = azimuth
-                continue
-            azimuth = (azimuth - middle + 0.5 * width) % width - 0.5 * width
-            weight = (1 + u * u + t * t) ** -1.5
-            r = min(int(np.arctan2(np.hypot(x, z), y) * height / np.pi), height - 1)
-            sums[r, 0] += weight
-            sums[r, 1] += weight * azimuth
-            sums[r, 2] += weight * azimuth * azimuth
-            whole += weight
-        for r in range(height):
-            if sums[r, 0] > 0:
-                mean = sums[r, 1] / sums[r, 0]
-                columns = np.sqrt(12 * max(sums[r, 2] / sums[r, 0] - mean * mean, LEAST_VARIANCE))
-                k = counts[texel + 1]
-                rows[texel, k] = r
-                found[texel, k] = middle + mean - columns / 2, columns, sums[r, 0] / (whole * columns)
-                counts[texel + 1] += 1
-    starts = np.cumsum(counts)
-    which, listed, intervals = (
-        np.empty(starts[-1], np.int64),
-        np.empty(starts[-1], np.int64),
-        np.empty((starts[-1], 3)),
-    )
-    for texel in numba.prange(texels):
-        first, last = starts[texel], starts[texel + 1]
-        which[first:last] = texel
-        listed[first:last] = rows[texel, : last - first]
-        intervals[first:last] = found[texel, : last - first]
-    return which, listed, intervals
+    rows = np.full((6 * n * n, most), -1, np.int32)
+    found = np.zeros((6 * n * n, most, 3))
+    _find_intervals(frames, height, width, s, rows, found)
+    met = rows >= 0
+    return np.nonzero(met)[0], rows[met].astype(np.int64), found[met]
+
+
+@numba.njit(parallel=True, cache=True)
+def _find_intervals(
+    frames: Doubles, height: int, width: int, s: int, rows: NDArray[np.int32], found: Doubles
+) -> None:
+    n = int(np.sqrt(len(rows) // 6))
+    for texel in numba.prange(len(rows)):
+        _find_intervals_of(texel, frames, n, (height, width), s, rows[texel], found[texel])
+
+
+@numba.njit(cache=True)
+def _find_intervals_of(
+    texel: int,
+    frames: Doubles,
+    n: int,
+    size: tuple[int, int],
+    s: int,
+    rows: NDArray[np.int32],
+    found: Doubles,
+) -> None:
+    """Of one texel; apart from the parallel loop, in which it would take three times as long to compile."""
+    height, width = size
+    sums = np.zeros((height, 3))  # weight, azimuth, its square
+    face, row, column = texel // (n * n), texel // n % n, texel % n
+    whole, middle = 0.0, 0.0
+    for p in range(-1, s * s):  # first the texel's centre
+        a = (row + 0.5) if p < 0 else (row + (p // s + 0.5) / s)
+        b = (column + 0.5) if p < 0 else (column + (p % s + 0.5) / s)
+        t, u = 2 * a / n - 1, 2 * b / n - 1
+        x = frames[face, 2, 0] + u * frames[face, 0, 0] + t * frames[face, 1, 0]
+        y = frames[face, 2, 1] + u * frames[face, 0, 1] + t * frames[face, 1, 1]
+        z = frames[face, 2, 2] + u * frames[face, 0, 2] + t * frames[face, 1, 2]
+        azimuth = np.arctan2(x, -z) * width / (2 * np.pi)
+        if p < 0:
+            middle = azimuth
+            continue
+        azimuth = (azimuth - middle + 0.5 * width) % width - 0.5 * width
+        weight = (1 + u * u + t * t) ** -1.5
+        r = min(int(np.arctan2(np.hypot(x, z), y) * height / np.pi), height - 1)
+        sums[r, 0] += weight
+        sums[r, 1] += weight * azimuth
+        sums[r, 2] += weight * azimuth * azimuth
+        whole += weight
+    k = 0
+    for r in range(height):
+        if sums[r, 0] > 0:
+            mean = sums[r, 1] / sums[r, 0]
+            columns = np.sqrt(12 * max(sums[r, 2] / sums[r, 0] - mean * mean, LEAST_VARIANCE))
+            rows[k] = r
+            found[k, 0], found[k, 1] = middle + mean - columns / 2, columns
+            found[k, 2] = sums[r, 0] / (whole * columns)
+            k += 1
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

@@ -119,35 +119,56 @@ def choose_features(
     """
     chosen = np.full((len(neighbours), count), -1, np.int32)
     for i in numba.prange(len(neighbours)):
-        near = neighbours[i][neighbours[i] >= 0]
-        weight = _weights(rows, features, near)
-        least = _largest(weight, count) if count < len(weight) else 0.0
-        ties = count - (weight > least).sum()  # how many of the least are taken
-        place = 0
-        for j in range(len(weight)):
-            if weight[j] > least or (weight[j] == least and ties > 0 and least > 0):
-                ties -= weight[j] == least
-                chosen[i, place] = j
-                place += 1
+        _choose(neighbours[i], rows, features, chosen[i])
     return chosen
 
 
 @numba.njit(cache=True)
+def _choose(
+    neighbours: NDArray[np.int32], rows: NDArray[np.float32], features: Bits, chosen: NDArray[np.int32]
+) -> None:
+    """For one vertex; apart from the parallel loop, into which it would be compiled twice."""
+    count = len(chosen)
+    weight = _weights(rows, features, neighbours)
+    least = _largest(weight, count)
+    ties, place = count, 0  # how many of the least are taken
+    for j in range(len(weight)):
+        ties -= weight[j] > least
+    for j in range(len(weight)):
+        if weight[j] > least or (weight[j] == least and ties > 0 and least > 0):
+            ties -= weight[j] == least
+            chosen[place] = j
+            place += 1
+
+
+@numba.njit(cache=True)
 def _largest(weight: NDArray[np.float64], count: int) -> float:
-    """The ``count``-th largest; apart from the parallel loop, into which it would be compiled twice."""
-    return np.partition(weight, len(weight) - count)[len(weight) - count]
+    """The ``count``-th largest of these and 0; NumPy's takes seconds to compile."""
+    largest = np.zeros(count + 1)  # descending, and one that falls out
+    for j in range(len(weight)):
+        k = count
+        while k > 0 and largest[k - 1] < weight[j]:
+            largest[k] = largest[k - 1]
+            k -= 1
+        largest[k] = weight[j]
+    return largest[max(count - 1, 0)]
 
 
 @numba.njit(cache=True)
 def _weights(rows: NDArray[np.float32], features: Bits, near: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Variance x number of features for every direction, over the neighbours ``near``."""
+    """Variance x number of features for every direction, over neighbours ``near`` (-1 where there are fewer)."""
     n_directions = rows.shape[1]
     total, squares = np.zeros(n_directions), np.zeros(n_directions)
-    times = np.zeros(n_directions, np.int64)
+    times, known = np.zeros(n_directions, np.int64), 0
     for row in near:
+        if row < 0:
+            continue
+        known += 1
         for j in range(n_directions):
             total[j] += rows[row, j]
             squares[j] += np.float64(rows[row, j]) * rows[row, j]
             times[j] += (features[row, j >> 5] >> np.uint32(j & 31)) & np.uint32(1)
-    known = max(len(near), 1)
-    return np.maximum(squares / known - (total / known) ** 2, 0.0) * times
+    for j in range(n_directions):  # the weights take the place of the squares
+        mean = total[j] / max(known, 1)
+        squares[j] = max(squares[j] / max(known, 1) - mean * mean, 0.0) * times[j]
+    return squares
