@@ -18,6 +18,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.measurement.measurement import mesh_vertices
     from mi_sparse_prt.measurement.pixels import camera_pixels
     from mi_sparse_prt.precompute import precompute, precompute_glossy
+    from mi_sparse_prt.relighting.fixed_camera import FixedCamera
     from mi_sparse_prt.relighting.image import render
     from mi_sparse_prt.relighting.light import TurningLight
     from mi_sparse_prt.relighting.relighter import Relighter
@@ -32,6 +33,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "CubemapLighting": "emission.cubemap",
     "Environment": "emission.environment",
+    "FixedCamera": "relighting.fixed_camera",
     "GlossyTransport": "transport",
     "LightTransport": "transport",
     "Relighter": "relighting.relighter",
@@ -54,6 +56,7 @@ _MODULES = {
 __all__ = [
     "CubemapLighting",
     "Environment",
+    "FixedCamera",
     "GlossyTransport",
     "LightTransport",
     "PrtError",

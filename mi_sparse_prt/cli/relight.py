@@ -123,7 +123,7 @@ def relight(
         from mi_sparse_prt import load_environment, load_transport
         from mi_sparse_prt.cli.film import check_frame_folder, make_film, new_frames
         from mi_sparse_prt.core.profiling import Stopwatch
-        from mi_sparse_prt.relighting.film import film_lights
+        from mi_sparse_prt.relighting.film import film_images, film_lights
 
         if frames is not None and output is not None and folder:
             check_frame_folder(output, frames)
@@ -141,7 +141,8 @@ def relight(
                 report["to"] = last.report
             with clock.phase("render"):
                 into = new_frames(command, output, frames, fps, exposure, folder)
-                images = map(view.image, film_lights(light, last, rotate, frames))
+                lights = film_lights(light, last, rotate, frames)
+                images = film_images(view.scene, view.transport, lights, view.sensor, view.spp)
                 sizes = {output: make_film(command, into, images, frames, not quiet)}
             report["film"] = {"path": str(output), "frames": frames, "bytes": sizes[output]}
             report["film"] |= {} if folder else {"fps": fps}

@@ -1,13 +1,18 @@
-"""Environments of a film, frame by frame: one that turns, and one that becomes another meanwhile."""
+"""Frames of a film: environments, one that turns and one that becomes another meanwhile, and what a camera sees."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.relighting.fixed_camera import FixedCamera, stands_for_pictures
+from mi_sparse_prt.relighting.image import render
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
 Floats = NDArray[np.float32]
 
@@ -37,6 +42,23 @@ def film_lights(
             share = np.float32(t)
             light = Environment((1 - share) * pixels[0] + share * pixels[1], first.rotation)
         yield light.rotated(degrees * t)
+
+
+def film_images(
+    scene: Scene, transport: LightTransport, lights: Iterable[Environment], sensor: int | mi.Sensor, spp: int
+) -> Iterator[Floats]:
+    """Pictures (height, width, 3), linear RGB, of a camera that stands still under one light after the other.
+
+    Rays are traced for the first picture alone, unless they go on from mirrors, glass or masks: then for each, as by
+    ``render``.
+    """
+    if not stands_for_pictures(scene, transport):
+        for light in lights:
+            yield render(scene, transport, light, sensor, spp)
+        return
+    camera = FixedCamera(scene, transport, sensor, spp)
+    for light in lights:
+        yield camera.image(transport.incident.relight(transport.emission.project(light)), light)
 
 
 def _of_one_size(first: Floats, last: Floats) -> tuple[Floats, Floats]:

@@ -18,7 +18,9 @@ from scipy.sparse import csr_matrix
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
 from mi_sparse_prt.relighting.image import RelitScene, background_emitter, relit_scene
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -71,32 +73,30 @@ class FixedCamera:
         if spp < 1:
             raise PrtError(f"{spp} samples per pixel: give 1 or more")
         camera, self._transport = scene.sensor(sensor), transport.for_scene(scene)
-        if transport.measurement.kind != "vertices" or transport.emission.kind != "cubemap":
-            raise PrtError("a fixed camera needs a matrix of vertices and a cubemap: use render")
-        relit = relit_scene(scene, self._transport, np.zeros((transport.emission.size, 3), np.float32))
-        if relit.goes_on:
+        if not stands_for_pictures(scene, self._transport):
             raise PrtError(
-                "rays go on from mirrors, glass, masks or surfaces without in-out factors: use render"
+                "a fixed camera needs a matrix of vertices and a cubemap, and no mirrors, glass, masks or surfaces "
+                "without in-out factors, from which rays go on: use render"
             )
+        relit = relit_scene(scene, self._transport, np.zeros((transport.emission.size, 3), np.float32))
         width, height = (int(n) for n in camera.film().crop_size())
         self.size = height, width
         rows = _rows(self._transport)
-        strata = int(np.ceil(np.sqrt(spp)))
-        offsets = _Filter(camera.film().rfilter(), strata)
-        step = max(1, SAMPLES_PER_BLOCK // strata**2)
-        blocks = range(0, height * width, step)
+        samples = _Samples(camera, int(np.ceil(np.sqrt(spp))), seed)
+        lines = max(1, SAMPLES_PER_BLOCK // (width * samples.spp))
         parts = [
-            _block(relit, camera, offsets, np.arange(first, min(first + step, height * width)), rows, seed)
-            for first in tqdm(blocks, desc="pixels", unit=" blocks", disable=not progress)
+            _block(relit, samples, np.arange(first, min(first + lines, height)), rows)
+            for first in tqdm(range(0, height, lines), desc="pixels", unit=" blocks", disable=not progress)
         ]
         self._pixels = _Sums.joined([part[0] for part in parts])
-        self._directions = np.concatenate([part[2] for part in parts])
-        each = np.arange(len(self._directions), dtype=np.int32)
+        directions = np.concatenate([part[2] for part in parts], axis=1)
+        self._directions = mi.Vector3f(directions)
+        each = np.arange(directions.shape[1], dtype=np.int32)
         self._beyond = replace(_Sums.joined([part[1] for part in parts]), places=each)
 
     @property
     def nbytes(self) -> int:
-        return self._pixels.nbytes + self._beyond.nbytes + self._directions.nbytes
+        return self._pixels.nbytes + self._beyond.nbytes + 12 * len(self._beyond.places)
 
     def image(
         self, incident: Floats, environment: Environment | mi.Emitter | ArrayLike | None = None
@@ -125,16 +125,23 @@ class FixedCamera:
                 f"light has the shape {incident.shape}, this matrix has {self._transport.incident.shape[0]} rows"
             )
         image = self._pixels @ incident
-        if environment is not None and len(self._directions):
+        if environment is not None and len(self._beyond.places):
             image += self._beyond @ self._background(environment)
         return image.reshape(*self.size, 3)
 
     def _background(self, environment: Any) -> Floats:
-        """Radiance (k, 3) in the directions in which samples leave the scene."""
+        """Radiance (k, 3) where samples leave the scene."""
         emitter = background_emitter(environment, self._transport.lighting)
-        si = dr.zeros(mi.SurfaceInteraction3f, len(self._directions))
-        si.wi = -mi.Vector3f(np.ascontiguousarray(self._directions.T))
-        return np.ascontiguousarray(np.array(emitter.eval(si)).T)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = -self._directions
+        return np.array(dr.ravel(emitter.eval(si))).reshape(-1, 3)
+
+
+def stands_for_pictures(scene: Scene, transport: LightTransport) -> bool:
+    """Whether pixels are sums over vertices: not for matrices of pixels and lamps, nor where rays go on."""
+    if transport.measurement.kind != "vertices" or transport.emission.kind != CubemapLighting.kind:
+        return False
+    return not (scene.specular or surfaces_to_follow(scene, transport.reflection))
 
 
 @dataclass(frozen=True)
@@ -170,37 +177,62 @@ class _Sums:
         return _sums(self.starts, self.places, self.values, colours)
 
 
-class _Filter:
-    """Places of samples around the centre of a pixel, as many where a reconstruction filter is twice as large, twice.
+class _Samples:
+    """Rays of a camera: around the centre of a pixel, as many where the reconstruction filter is twice as large, twice.
 
     Parameters
     ----------
-    rfilter : mi.ReconstructionFilter
-        Separable; where it is negative, so are samples.
+    camera : mi.Sensor
+        Its film's filter is separable; where it is negative, so are samples.
     strata : int
-        Samples of each axis.
+        Samples of each axis of a pixel.
+    seed : int
     """
 
-    def __init__(self, rfilter: mi.ReconstructionFilter, strata: int) -> None:
-        radius = rfilter.radius()
-        ends = np.linspace(-radius, radius, STEPS + 1)
+    def __init__(self, camera: mi.Sensor, strata: int, seed: int) -> None:
+        self._camera, self._strata, self._seed, self.spp = camera, strata, seed, strata**2
+        rfilter = camera.film().rfilter()
+        self._radius = rfilter.radius()
+        ends = np.linspace(-self._radius, self._radius, STEPS + 1)
         heights = np.array(rfilter.eval(mi.Float(((ends[1:] + ends[:-1]) / 2).astype(np.float32))))
-        self._ends, self._signs = ends, np.sign(heights)
-        self._cdf = np.concatenate([[0], np.cumsum(np.abs(heights), dtype=np.float64)])
-        self.strata = strata
+        self._signs = np.sign(heights).astype(np.float32)
+        below = np.concatenate([[0], np.cumsum(np.abs(heights), dtype=np.float64)])
+        shares = np.linspace(0, below[-1], STEPS + 1)
+        self._places = np.interp(shares, below, ends).astype(np.float32)  # below which such shares lie
 
-    def samples(self, pixels: int, random: np.random.Generator) -> tuple[Floats, Floats]:
-        """Offsets (pixels, spp, 2), in pixels, and weights (pixels, spp) whose sum is 1 for each pixel."""
-        k, n = self.strata, self.strata**2
-        jitter = random.random((pixels, n, 2))
-        cell = np.stack(np.divmod(np.arange(n), k), axis=1)
-        shares = (cell + jitter) / k * self._cdf[-1]
-        offsets = np.interp(shares, self._cdf, self._ends)
-        step = np.clip(np.searchsorted(self._ends, offsets, "right") - 1, 0, STEPS - 1)
-        signs = self._signs[step].prod(axis=2)
-        total = signs.sum(axis=1, keepdims=True)
-        weights = np.divide(signs, total, out=np.full_like(signs, 1 / n), where=total > 0)
-        return offsets.astype(np.float32), weights.astype(np.float32)
+    def rays(self, lines: Ints) -> tuple[mi.Ray3f, mi.Point2f, Floats]:
+        """Of all pixels of some lines of the picture: rays, random numbers, and weights (rays, rgb)."""
+        size, start = np.array(self._camera.film().crop_size()), self._camera.shutter_open()
+        random = np.stack(
+            [
+                np.random.default_rng((self._seed, int(y))).random((size[0], self.spp, 7), np.float32)
+                for y in lines
+            ]
+        )
+        offsets, weights = self._places_in_pixels(random[..., :2])
+        centre = np.stack(np.meshgrid(np.arange(size[0]), lines), axis=-1) + np.float32(0.5)
+        position = ((centre[:, :, None] + offsets) / size).astype(np.float32)  # in the crop window
+        moment, *others = np.moveaxis(random[..., 2:].reshape(-1, 5), 1, 0)
+        ray, brightness = self._camera.sample_ray(
+            mi.Float(start + moment * np.float32(self._camera.shutter_open_time())),
+            mi.Float(0.5),
+            mi.Point2f(np.ascontiguousarray(position.reshape(-1, 2).T)),
+            mi.Point2f(np.ascontiguousarray(others[:2])),
+        )
+        colour = np.array(brightness + dr.zeros(mi.Color3f, len(moment))).T
+        return mi.Ray3f(ray), mi.Point2f(np.ascontiguousarray(others[2:])), weights.reshape(-1, 1) * colour
+
+    def _places_in_pixels(self, random: Floats) -> tuple[Floats, Floats]:
+        """Offsets (..., spp, 2), in pixels, and weights (..., spp) whose sum is 1 for each pixel."""
+        cell = np.stack(np.divmod(np.arange(self.spp), self._strata), axis=1)
+        steps = (cell + random) * np.float32(STEPS / self._strata)
+        low = np.minimum(steps.astype(np.int32), STEPS - 1)
+        offsets = self._places[low] + (steps - low) * (self._places[low + 1] - self._places[low])
+        inside = (offsets / self._radius + 1) * (STEPS / 2)
+        signs = self._signs[np.clip(inside.astype(np.int32), 0, STEPS - 1)].prod(axis=-1)
+        total = signs.sum(axis=-1, keepdims=True)
+        weights = np.divide(signs, total, out=np.full_like(signs, 1 / self.spp), where=total > 0)
+        return offsets.astype(np.float32), weights
 
 
 def _rows(transport: LightTransport) -> Ints:
@@ -209,37 +241,23 @@ def _rows(transport: LightTransport) -> Ints:
     rows = np.full((1 + terms, n), -1)
     rows[0] = np.arange(n)
     if terms:
-        glossy = np.flatnonzero(transport.reflection.glossy)
+        glossy = transport.reflection.glossy  # their numbers
         rows[1:, glossy] = n + np.arange(len(glossy) * terms).reshape(-1, terms).T
     return rows
 
 
-def _block(
-    relit: RelitScene, camera: mi.Sensor, offsets: _Filter, pixels: Ints, rows: Ints, seed: int
-) -> tuple[_Sums, _Sums, Floats]:
-    """Sums over vertices and over rays that leave, for some pixels, and the directions of these rays."""
-    random = np.random.default_rng((seed, int(pixels[0])))
-    spp = offsets.strata**2
-    places, weights = offsets.samples(len(pixels), random)
-    size = np.array(camera.film().crop_size())  # a camera's positions are those in its crop window
-    corner = np.stack([pixels % size[0], pixels // size[0]], axis=1)[:, None]
-    position = ((corner + 0.5 + places) / size).reshape(-1, 2).astype(np.float32)
-    moment = np.float32(camera.shutter_open()) + random.random(len(position), np.float32) * np.float32(
-        camera.shutter_open_time()
-    )
-    lens, u = random.random((2, 2, len(position)), np.float32)
-    ray, brightness = camera.sample_ray(
-        mi.Float(moment), mi.Float(0.5), mi.Point2f(np.ascontiguousarray(position.T)), mi.Point2f(lens)
-    )
-    shares, lit, leaves = relit.footprint(mi.Ray3f(ray), mi.Point2f(u))
-    dr.eval(shares, lit, leaves, brightness)
-    own = np.repeat(np.arange(len(pixels)), spp)
-    scale = weights.reshape(-1, 1) * np.array(brightness + dr.zeros(mi.Color3f, len(own))).T
-    sums = _collected(shares, np.array(lit), own, scale, rows, len(pixels))
+def _block(relit: RelitScene, samples: _Samples, lines: Ints, rows: Ints) -> tuple[_Sums, _Sums, Floats]:
+    """Sums over vertices and over rays that leave, for some lines, and the directions (3, k) of these rays."""
+    ray, u, weights = samples.rays(lines)
+    shares, lit, leaves = relit.footprint(ray, u)
+    dr.eval(shares, lit, leaves)
+    own = np.arange(len(weights)) // samples.spp
+    n_pixels = len(weights) // samples.spp
+    sums = _collected(shares, np.array(lit), own, weights, rows, n_pixels)
     away = np.flatnonzero(np.array(leaves))
-    starts = np.concatenate([[0], np.cumsum(np.bincount(own[away], minlength=len(pixels)))])
-    beyond = _Sums(starts, np.arange(len(away), dtype=np.int32), scale[away])
-    return sums, beyond, np.array(ray.d).T[away]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(own[away], minlength=n_pixels))])
+    beyond = _Sums(starts, np.arange(len(away), dtype=np.int32), weights[away])
+    return sums, beyond, np.array(ray.d)[:, away]
 
 
 def _collected(

@@ -131,9 +131,14 @@ class Relighter:
         self.player.apply(update)
         self._started = True
 
+    @property
+    def incident(self) -> Floats:
+        """Light (rows, 3) of vertices and terms in the last frame, for ``FixedCamera.image``."""
+        return self.player.incident
+
     def colours(self, outgoing: ArrayLike | None = None) -> Floats:
         """What leaves the points under the light of the last frame: also for another view alone."""
         reflection, measurement = self.transport.reflection, self.transport.measurement
         if isinstance(reflection, Diffuse) and measurement.weights is None:
             return self.player.radiance(reflection.albedo)
-        return self.transport.leaving(self.player.incident, outgoing)
+        return self.transport.leaving(self.incident, outgoing)
