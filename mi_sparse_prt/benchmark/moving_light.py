@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.benchmark.measuring import kept_memory, report_header
 from mi_sparse_prt.benchmark.moving_light_figures import moving_light_figures
+from mi_sparse_prt.benchmark.moving_light_pictures import measure_pictures
 from mi_sparse_prt.benchmark.moving_light_speed import measure_frames
 from mi_sparse_prt.benchmark.relit_reference import environments_of
 from mi_sparse_prt.compression.compress import compress
@@ -31,9 +33,10 @@ from mi_sparse_prt.relighting.approximations import (
     weighted_error,
 )
 from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
+from mi_sparse_prt.relighting.fixed_camera import stands_for_pictures
 from mi_sparse_prt.relighting.light import TurningLight
 from mi_sparse_prt.relighting.players import ClusteredPlayer
-from mi_sparse_prt.relighting.sequences import turning
+from mi_sparse_prt.relighting.sequences import cut, interpolation, moving_disc, turning
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.validation.validate import save_figures
 
@@ -99,7 +102,7 @@ def measure_moving_light(
     lighting : CubemapLighting
     progress : bool
     figures : path, optional
-        Folder for the counterparts of [OBRG06] Figures 2 to 5, 7 and 9.
+        Folder for the counterparts of [OBRG06] Figures 2 to 5 and 7 to 12.
     effort : MovingEffort
 
     Returns
@@ -109,8 +112,10 @@ def measure_moving_light(
         the weighted L1 error of wavelets), ``sphere`` (of the L1 error of radiance), ``image`` (of the relative L2 of
         vertex colours against the exact product), ``flicker`` (of the change of the image's error from frame to frame),
         ``frames`` (the first of these, frame by frame) and ``resets`` per band. ``stop``: frames after the stop until
-        the error is below that of others, still. ``vectors``: relative L2 of a quarter of the weights. ``frames``: see
-        ``measure_frames``. ``matrix``: errors and sizes of what is played.
+        the error is below that of others, still. ``vectors``: relative L2 of a quarter of the weights. ``changing``:
+        the same of a light that becomes another, of a round one that moves and grows, and of a cut. ``frames``: see
+        ``measure_frames``. ``pictures``: see ``measure_pictures``; None for scenes without a camera, or whose pictures
+        are no sums over vertices. ``matrix``: errors and sizes of what is played.
     """
     transport = precompute(scene, lighting, target_error=effort.target_error, progress=progress)
     compressed = compress(transport, progress=progress)
@@ -130,11 +135,34 @@ def measure_moving_light(
         frames = list(turning(lights[name], degrees, effort.frames, effort.still))
         case = _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames)
         report["turning"].setdefault(name, {})[f"{degrees:g}"] = case.measured()
+    changing = _changing(lights, lighting, effort)
+    report["changing"] = {
+        name: _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames).measured()
+        for name, frames in tqdm(changing.items(), desc="changing light", disable=not progress)
+    }
     report["frames"] = measure_frames(transport, compressed, clusters, next(iter(lights.values())), progress)
+    shown = "sunset" if "sunset" in lights else next(iter(lights))
+    report["pictures"] = None
+    pictures: dict[str, Figure] = {}
+    if scene.mitsuba.sensors() and stands_for_pictures(scene, compressed):
+        ordered = {shown: lights[shown], **lights}
+        report["pictures"], pictures = measure_pictures(scene, compressed, clusters, ordered)
     if figures is not None:
-        shown = "sunset" if "sunset" in lights else next(iter(lights))
-        save_figures(figures, moving_light_figures(report, lights[shown], shown))
+        save_figures(figures, moving_light_figures(report, lights[shown], shown) | pictures)
     return report
+
+
+def _changing(
+    lights: dict[str, TurningLight], lighting: CubemapLighting, effort: MovingEffort
+) -> dict[str, list[Floats]]:
+    """Lights that change and do not turn."""
+    (first, a), (second, b) = [(name, light.exact(0)) for name, light in lights.items()][:2]
+    frames, still = effort.frames, effort.still
+    return {
+        f"{first} becomes {second}": list(interpolation(a, b, frames, still)),
+        "a round light": list(moving_disc(lighting, frames=frames, still=still)),
+        f"{first} is cut to {second}": list(cut(a, b, frames // 2, frames + still)),
+    }
 
 
 class _Case:

@@ -65,10 +65,10 @@ def test_cpca(tmp_path) -> None:
     assert "ball" in printed(cpca_tables(report))
 
 
-def test_moving_light() -> None:
+def test_moving_light(tmp_path) -> None:
     """What holds for any turn: more wavelets are better, those that go on better than those that start anew."""
     scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(20, 8, (60,), target_error=0.2)
-    report = measure_moving_light(scene, prt.CubemapLighting(8), False, None, effort)
+    report = measure_moving_light(scene, prt.CubemapLighting(8), False, tmp_path, effort)
     json.dumps(report)
     assert report["turning"].keys() == {"sky", "sun"}
     for turns in report["turning"].values():
@@ -85,7 +85,33 @@ def test_moving_light() -> None:
     frames = report["frames"]
     assert frames["product"]["bytes"] == 4 * len(scene.positions) * 384
     assert all(way["per_second"] > 0 for way in frames.values() if "per_second" in way)
-    assert "a quarter of the weights" in printed(moving_light_tables(report))
+    assert report["changing"].keys() == {"sky becomes sun", "a round light", "sky is cut to sun"}
+    for case in report["changing"].values():
+        assert case["methods"]["PBI(30)"]["frames"][-1] < case["methods"]["NWA(30)"]["frames"][-1] + 1e-6
+    assert_pictures(report["pictures"])
+    names = {"moving_lights", "pictures_over_time", "pictures_by_budget", "pictures_of_changes", "clusters"}
+    assert names <= {path.stem for path in tmp_path.iterdir()}
+    tables = printed(moving_light_tables(report))
+    assert "a quarter of the weights" in tables and "with background" in tables and "FLIP" in tables
+
+
+def assert_pictures(found: dict) -> None:
+    """What [OBRG06] says of its Figures 8 and 10 to 12: exact pictures of light that stands, better ones of motion."""
+
+    def error(figure: str, row: str, column: str) -> float:
+        return found[figure][row][column]["relative_l2"]
+
+    over_time, changes = "pictures_over_time", "pictures_of_changes"
+    assert error(over_time, "PBI(30)", "frame 400") < 1e-4 < 1e-3 < error(over_time, "NWA(30)", "frame 400")
+    for column in ("turning", "becoming another"):
+        assert error(changes, "PBI(30)", column) < error(changes, "NWA(30)", column)
+    assert error(changes, "PBI(30)", "the view alone") < 1e-4 < error(changes, "NWA(100)", "the view alone")
+    for row in ("NWA, moving", "PBI, moving"):
+        errors = [error("pictures_by_budget", row, f"{k} wavelets") for k in (30, 100, 300)]
+        assert errors[0] > errors[1] > errors[2]
+    clusters = [pictures["picture"]["relative_l2"] for pictures in found["pictures_of_clusters"].values()]
+    assert clusters == sorted(clusters, reverse=True) and clusters[-1] == 0
+    assert found["camera"]["size"] == (36, 48) and found["camera"]["nbytes"] > 0
 
 
 def test_glossy(tmp_path) -> None:
