@@ -34,6 +34,7 @@ Ints = NDArray[np.int64]
 
 REFRESH = 128  # frames within which all clusters are summed anew
 MANY = 4  # a whole product is quicker than a sum of more columns than this part of all
+DROPPED = 18  # bits of a float that do not tell how much a change matters: to within 3%
 COEFFICIENTS = 512  # of clusters, that a thread works on at a time: they stay in its cache
 
 
@@ -192,6 +193,7 @@ class ClusteredPlayer(Player):
         self._sums = np.zeros((self._groups, 3, values))
         self._done = np.zeros((3, values))  # coefficients of clusters that rows show
         self._rows = np.zeros((3, rows), np.float32)  # by cluster
+        self._bins = np.zeros(1 << (31 - DROPPED), np.int32)
         self._frame = 0
 
     @property
@@ -221,12 +223,12 @@ class ClusteredPlayer(Player):
         parts = update.coefficients, update.changes, update.starts, update.resets
         return _add_to_clusters(columns, parts, self._sums)
 
-    def _least(self, changes: Doubles) -> float:
+    def _least(self, changes: Floats) -> float:
         """Changes from here on are applied; the first frame is exact."""
-        left = changes.size - self.vectors * len(changes)
-        if left <= 0 or self._frame == 0:
+        count = self.vectors * len(changes)
+        if count >= changes.size or self._frame == 0:
             return 0.0
-        return float(np.partition(changes.ravel(), left)[left])
+        return float(_threshold(changes.ravel(), count, self._bins))
 
     def column_norms(self) -> Floats | None:
         return self.clusters.norms()
@@ -260,22 +262,44 @@ def _add_to_clusters(
 
 
 @numba.njit(fastmath=True, cache=True)
-def _changes(now: Doubles, done: Doubles, norms: Doubles) -> Doubles:
-    """How much it matters that coefficients of vectors changed, squared: (clusters, b)."""
+def _changes(now: Doubles, done: Doubles, norms: Doubles) -> Floats:
+    """How much it matters that coefficients of vectors changed: (clusters, b)."""
     clusters, b = norms.shape
-    sizes = np.empty((clusters, b))
+    sizes = np.empty((clusters, b), np.float32)
     for c in range(clusters):
+        first = c * (b + 1) + 1
         for q in range(b):
-            square, at = 0.0, c * (b + 1) + 1 + q
-            for colour in range(3):
-                square += (now[colour, at] - done[colour, at]) ** 2
-            sizes[c, q] = norms[c, q] * norms[c, q] * square
+            red = now[0, first + q] - done[0, first + q]
+            green = now[1, first + q] - done[1, first + q]
+            blue = now[2, first + q] - done[2, first + q]
+            sizes[c, q] = norms[c, q] * np.sqrt(red * red + green * green + blue * blue)
     return sizes
+
+
+@numba.njit(cache=True)
+def _threshold(sizes: Floats, count: int, bins: NDArray[np.int32]) -> np.float32:
+    """What at least ``count`` sizes reach, and few more: the highest of as many as are alike to within 3%.
+
+    Floats that are not negative have the order of their bits: the first count in ``bins``, 0 before and after.
+    """
+    bits, top = sizes.view(np.int32), 0
+    for k in range(len(bits)):
+        place = bits[k] >> DROPPED
+        bins[place] += 1
+        top = max(top, place)
+    reached, least = 0, np.zeros(1, np.int32)
+    while top > 0 and reached < count:
+        reached += bins[top]
+        least[0] = top << DROPPED
+        top -= 1
+    for k in range(len(bits)):
+        bins[bits[k] >> DROPPED] = 0
+    return least.view(np.float32)[0]
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _add_to_rows(
-    clusters: tuple[Doubles, Doubles, Doubles],
+    clusters: tuple[Doubles, Doubles, Floats],
     layout: tuple[Floats, Ints],
     frame: tuple[float, int],
     rows: Floats,
