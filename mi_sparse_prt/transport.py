@@ -90,6 +90,16 @@ class LightTransport:
     scene_hash: str
     report: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """One line: what it is of, and how well it is known; its arrays may have billions of numbers."""
+        parts = ", ".join(f"{name}: {type(operator).__name__}" for name, operator in self.operators.items())
+        error = (self.report.get("estimated_error") or {}).get("total")
+        known = "" if error is None else f", estimated error {error:.2%}"
+        return (
+            f"{type(self).__name__}({self.measurement!r} x {self.emission!r}, {parts}, "
+            f"{self.nbytes / 1e6:.1f} MB{known})"
+        )
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """(outputs of the measurement, elements of the emission space, 3)."""

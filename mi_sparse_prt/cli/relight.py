@@ -15,6 +15,8 @@ from mi_sparse_prt.cli.tables.written import relighting_table
 from mi_sparse_prt.core.errors import PrtError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -88,6 +90,12 @@ class _View:
 
         return render(self.scene, self.transport, light, self.sensor, self.spp, progress=progress)
 
+    def film(self, lights: Iterable[Environment]) -> Iterator[NDArray[np.float32]]:
+        """An image for each light, by a camera that stands still."""
+        from mi_sparse_prt.relighting.film import film_images
+
+        return film_images(self.scene, self.transport, lights, self.sensor, self.spp)
+
 
 def relight(
     matrix: options.MatrixFile,
@@ -123,7 +131,7 @@ def relight(
         from mi_sparse_prt import load_environment, load_transport
         from mi_sparse_prt.cli.film import check_frame_folder, make_film, new_frames
         from mi_sparse_prt.core.profiling import Stopwatch
-        from mi_sparse_prt.relighting.film import film_images, film_lights
+        from mi_sparse_prt.relighting.film import film_lights
 
         if frames is not None and output is not None and folder:
             check_frame_folder(output, frames)
@@ -141,8 +149,7 @@ def relight(
                 report["to"] = last.report
             with clock.phase("render"):
                 into = new_frames(command, output, frames, fps, exposure, folder)
-                lights = film_lights(light, last, rotate, frames)
-                images = film_images(view.scene, view.transport, lights, view.sensor, view.spp)
+                images = view.film(film_lights(light, last, rotate, frames))
                 sizes = {output: make_film(command, into, images, frames, not quiet)}
             report["film"] = {"path": str(output), "frames": frames, "bytes": sizes[output]}
             report["film"] |= {} if folder else {"fps": fps}

@@ -82,6 +82,9 @@ class Measurement:
     weights: scipy.sparse.csr_array | None = None
     image: tuple[int, int] | None = None
 
+    def __repr__(self) -> str:
+        return f"Measurement({self.outputs} {self.kind})"
+
     def __len__(self) -> int:
         """Points."""
         return len(self.keys)

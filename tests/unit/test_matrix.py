@@ -96,6 +96,15 @@ def close(a: NDArray, b: NDArray) -> bool:
     return bool(np.abs(a - b).max() <= 1e-6 * np.abs(b).max()) and a.shape == b.shape
 
 
+def test_what_a_matrix_says_of_itself_is_a_line(transport):
+    words = repr(transport)
+    assert len(words) < 250 and "\n" not in words
+    assert f"{transport.shape[0]} vertices" in words and f"{transport.nbytes / 1e6:.1f} MB" in words
+    assert all(name in words for name in transport.operators)
+    known = replace(transport, report={"estimated_error": {"total": 0.0123}})
+    assert "estimated error 1.23%" in repr(known)
+
+
 def test_rows_columns_and_relight_are_one_matrix(transport, full):
     rows = transport.rows(np.arange(N_V))
     columns = transport.columns(np.arange(6 * N * N))
