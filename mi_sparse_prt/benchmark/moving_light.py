@@ -135,33 +135,34 @@ def measure_moving_light(
         frames = list(turning(lights[name], degrees, effort.frames, effort.still))
         case = _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames)
         report["turning"].setdefault(name, {})[f"{degrees:g}"] = case.measured()
-    changing = _changing(lights, lighting, effort)
+    shown = "sunset" if "sunset" in lights else next(iter(lights))
+    other = next((name for name in lights if name != shown), None)
+    # an only one becomes itself, seen from behind
+    second = lights[shown].exact(180) if other is None else lights[other].exact(0)
+    changing = _changing(lights[shown].exact(0), second, lighting, effort)
     report["changing"] = {
         name: _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames).measured()
         for name, frames in tqdm(changing.items(), desc="changing light", disable=not progress)
     }
     report["frames"] = measure_frames(transport, compressed, clusters, next(iter(lights.values())), progress)
-    shown = "sunset" if "sunset" in lights else next(iter(lights))
     report["pictures"] = None
     pictures: dict[str, Figure] = {}
     if scene.mitsuba.sensors() and stands_for_pictures(scene, compressed):
-        ordered = {shown: lights[shown], **lights}
-        report["pictures"], pictures = measure_pictures(scene, compressed, clusters, ordered)
+        report["pictures"], pictures = measure_pictures(scene, compressed, clusters, lights[shown], second)
     if figures is not None:
         save_figures(figures, moving_light_figures(report, lights[shown], shown) | pictures)
     return report
 
 
 def _changing(
-    lights: dict[str, TurningLight], lighting: CubemapLighting, effort: MovingEffort
+    first: Floats, second: Floats, lighting: CubemapLighting, effort: MovingEffort
 ) -> dict[str, list[Floats]]:
     """Lights that change and do not turn."""
-    (first, a), (second, b) = [(name, light.exact(0)) for name, light in lights.items()][:2]
     frames, still = effort.frames, effort.still
     return {
-        f"{first} becomes {second}": list(interpolation(a, b, frames, still)),
+        "one light becomes another": list(interpolation(first, second, frames, still)),
         "a round light": list(moving_disc(lighting, frames=frames, still=still)),
-        f"{first} is cut to {second}": list(cut(a, b, frames // 2, frames + still)),
+        "a cut": list(cut(first, second, frames // 2, frames + still)),
     }
 
 

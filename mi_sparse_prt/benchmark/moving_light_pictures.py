@@ -79,7 +79,11 @@ class _Seen:
 
 
 def measure_pictures(
-    scene: Scene, compressed: LightTransport, clusters: ClusterColumns, lights: dict[str, TurningLight]
+    scene: Scene,
+    compressed: LightTransport,
+    clusters: ClusterColumns,
+    first: TurningLight,
+    second: Floats,
 ) -> tuple[Report, dict[str, Figure]]:
     """Errors of pictures of the scene's first camera, and the pictures themselves.
 
@@ -90,8 +94,9 @@ def measure_pictures(
     compressed : LightTransport
         By clustered PCA: ``clusters``.
     clusters : ClusterColumns
-    lights : dict of TurningLight
-        Two at least; the first turns, and becomes the second.
+    first : TurningLight
+        It turns, and becomes the second.
+    second : (n_directions, 3) float32
 
     Returns
     -------
@@ -101,7 +106,6 @@ def measure_pictures(
         ``render``.
     figures : dict
     """
-    first, second = list(lights.values())[:2]
     lighting = first.lighting
     start = time.perf_counter()
     camera = FixedCamera(scene, compressed, spp=SPP)
@@ -113,7 +117,7 @@ def measure_pictures(
     turn = list(turning(first, DEGREES, FRAMES, STILL))
     with _moved(scene) as sensor:
         aside = _Seen(FixedCamera(scene, compressed, sensor, SPP), clusters, seen.bands, scale)
-    becoming = list(interpolation(first.exact(0), second.exact(0), FRAMES))
+    becoming = list(interpolation(first.exact(0), second, FRAMES))
     every = {
         "pictures_over_time": _over_time(seen, turn),
         "pictures_by_budget": _by_budget(seen, turn),

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.heap import keep_largest
 from mi_sparse_prt.emission.haar import haar_bands
 
 Floats = NDArray[np.float32]
@@ -291,47 +292,7 @@ def _largest(sizes: Floats, count: int) -> Ints:
         places = np.argsort(-sizes, kind="stable")[:count]
         return places[sizes[places] > 0]
     room, places = np.empty(count, np.float32), np.empty(count, np.int64)
-    return places[: _keep_largest(sizes, count, room, places)]
-
-
-@numba.njit(cache=True)
-def _keep_largest(values: Floats, count: int, sizes: Floats, places: Ints) -> int:
-    """Write up to so many of the largest values that are not 0, descending, and their places; how many."""
-    length = 0
-    for j in range(len(values)):
-        value = values[j]
-        if value <= 0 or (length == count and value <= sizes[0]):
-            continue
-        if length < count:  # a heap: the least is at its root
-            k, length = length, length + 1
-            while k > 0 and sizes[(k - 1) // 2] > value:
-                sizes[k], places[k] = sizes[(k - 1) // 2], places[(k - 1) // 2]
-                k = (k - 1) // 2
-        else:
-            k = _sink(sizes, places, value, length)
-        sizes[k], places[k] = value, j
-    for end in range(length - 1, 0, -1):  # the least goes to the end, and so on
-        value, place = sizes[end], places[end]
-        sizes[end], places[end] = sizes[0], places[0]
-        k = _sink(sizes, places, value, end)
-        sizes[k], places[k] = value, place
-    return length
-
-
-@numba.njit(cache=True)
-def _sink(sizes: Floats, places: Ints, value: np.float32, length: int) -> int:
-    """Where a value goes in a heap whose root is free."""
-    k = 0
-    while True:
-        child = 2 * k + 1
-        if child >= length:
-            return k
-        if child + 1 < length and sizes[child + 1] < sizes[child]:
-            child += 1
-        if sizes[child] >= value:
-            return k
-        sizes[k], places[k] = sizes[child], places[child]
-        k = child
+    return places[: keep_largest(sizes, count, room, places)]
 
 
 @numba.njit(parallel=True, cache=True)
@@ -346,7 +307,7 @@ def _largest_of_bands(
         # a thread has all bands of a mode: the finest is most of the work
         mode, band = which // bands, which % bands
         own = values[mode, offsets[band] : offsets[band + 1]]
-        length = _keep_largest(own, count, sizes[mode, band], places[mode, band])
+        length = keep_largest(own, count, sizes[mode, band], places[mode, band])
         places[mode, band, :length] += offsets[band]
         lengths[mode, band] = length
         total = 0.0

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.core.heap import keep_largest
 
 
 def find_contested(
@@ -129,8 +130,12 @@ def _choose(
 ) -> None:
     """For one vertex; apart from the parallel loop, into which it would be compiled twice."""
     count = len(chosen)
+    if count == 0:
+        return
     weight = _weights(rows, features, neighbours)
-    least = _largest(weight, count)
+    largest = np.empty(count)
+    found = keep_largest(weight, count, largest, np.empty(count, np.int64))
+    least = largest[count - 1] if found == count else 0.0
     ties, place = count, 0  # how many of the least are taken
     for j in range(len(weight)):
         ties -= weight[j] > least
@@ -139,19 +144,6 @@ def _choose(
             ties -= weight[j] == least
             chosen[place] = j
             place += 1
-
-
-@numba.njit(cache=True)
-def _largest(weight: NDArray[np.float64], count: int) -> float:
-    """The ``count``-th largest of these and 0; NumPy's takes seconds to compile."""
-    largest = np.zeros(count + 1)  # descending, and one that falls out
-    for j in range(len(weight)):
-        k = count
-        while k > 0 and largest[k - 1] < weight[j]:
-            largest[k] = largest[k - 1]
-            k -= 1
-        largest[k] = weight[j]
-    return largest[max(count - 1, 0)]
 
 
 @numba.njit(cache=True)
