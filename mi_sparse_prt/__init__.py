@@ -22,6 +22,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.relighting.image import render
     from mi_sparse_prt.relighting.light import TurningLight
     from mi_sparse_prt.relighting.relighter import Relighter
+    from mi_sparse_prt.relighting.viewer.export import Page, make_page
     from mi_sparse_prt.scene.loading import load_scene
     from mi_sparse_prt.scene.scene import Scene
     from mi_sparse_prt.storage import load_transport
@@ -36,6 +37,7 @@ _MODULES = {
     "FixedCamera": "relighting.fixed_camera",
     "GlossyTransport": "transport",
     "LightTransport": "transport",
+    "Page": "relighting.viewer.export",
     "Relighter": "relighting.relighter",
     "Scene": "scene.scene",
     "SceneEmitters": "emission.emitters",
@@ -46,6 +48,7 @@ _MODULES = {
     "load_environment": "emission.environment",
     "load_scene": "scene.loading",
     "load_transport": "storage",
+    "make_page": "relighting.viewer.export",
     "mesh_vertices": "measurement.measurement",
     "precompute": "precompute",
     "precompute_glossy": "precompute",
@@ -59,6 +62,7 @@ __all__ = [
     "FixedCamera",
     "GlossyTransport",
     "LightTransport",
+    "Page",
     "PrtError",
     "PrtWarning",
     "Relighter",
@@ -71,6 +75,7 @@ __all__ = [
     "load_environment",
     "load_scene",
     "load_transport",
+    "make_page",
     "mesh_vertices",
     "precompute",
     "precompute_glossy",

@@ -7,9 +7,10 @@ fewer directions; colour exists only where the scene has any.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -232,6 +233,49 @@ class LightTransport:
             Radiance towards ``outgoing``; without it radiosity / pi, which is the radiance of a diffuse point.
         """
         return self.leaving(self._incident_light(lighting), outgoing)
+
+    def relight_many(
+        self,
+        lights: ArrayLike | Iterable[Any],
+        into: Callable[[int, Floats], object] | Any = None,
+        together: int = 256,
+    ) -> Floats | None:
+        """Radiosity / pi under many lights, some at a time: a year of skies, or one light after the other.
+
+        Parameters
+        ----------
+        lights : (n_directions, 3, k) float, or iterable
+            All L at once; or one after the other, as ``relight`` takes them: these need not be in memory together.
+        into : callable or array, optional
+            ``into(first, colours)`` is called for lights from number ``first`` on, with (n, 3, some) float32. Or an
+            array (n, 3, k) that takes ``into[:, :, first:last] = colours``, such as one of half floats or of Zarr.
+        together : int
+            Lights of a block: memory is that of a few arrays (n, 3, together).
+
+        Returns
+        -------
+        (n, 3, k) float32
+            Without ``into``; else None.
+
+        Raises
+        ------
+        PrtError
+            If ``together`` is below 1, or a light is not one of this matrix.
+        """
+        if together < 1:
+            raise PrtError(f"{together} lights together: give 1 or more")
+        found: list[Floats] = []
+        for first, block in _blocks_of(self.emission, lights, together):
+            colours = self.apply(block)
+            if into is None:
+                found.append(colours)
+            elif callable(into):
+                into(first, colours)
+            else:
+                into[:, :, first : first + colours.shape[2]] = colours
+        if into is not None:
+            return None
+        return np.concatenate(found, axis=2) if found else np.zeros((self.shape[0], 3, 0), np.float32)
 
     def leaving(self, incident: Floats, outgoing: ArrayLike | None = None) -> Floats:
         """What leaves points whose incident light (rows, 3) is known; ``outgoing`` and result as of ``relight``."""
@@ -488,6 +532,25 @@ def _linear_operator(apply: Any, adjoint: Any, shape: tuple[int, int], channel: 
         rmatmat=lambda y: product(adjoint, n, y),
         dtype=np.float32,
     )
+
+
+def _blocks_of(emission: EmissionSpace, lights: Any, together: int) -> Iterator[tuple[int, Floats]]:
+    """Lights (n_directions, 3, some), and the number of the first of these."""
+    if not isinstance(lights, np.ndarray):
+        remaining, first = iter(lights), 0
+        while some := [emission.project(light) for light in islice(remaining, together)]:
+            yield first, np.stack(some, axis=2)
+            first += len(some)
+        return
+    if lights.ndim != 3 or lights.shape[:2] != (emission.size, 3):
+        raise PrtError(
+            f"lights of shape {lights.shape}: give ({emission.size}, 3, k), or one after the other"
+        )
+    for first in range(0, lights.shape[2], together):
+        block = np.ascontiguousarray(lights[:, :, first : first + together], np.float32)
+        if not np.isfinite(block).all():
+            raise PrtError(f"lights from number {first} on have values that are NaN or infinite")
+        yield first, block
 
 
 def row_order(scene_hash: str, keys: NDArray[np.uint64], scene: Scene) -> NDArray[np.int64] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,15 @@ from mi_sparse_prt.benchmark.relit_reference import environments_of
 from mi_sparse_prt.compression.compress import compress
 from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.haar import haar_colours, inverse_haar
+from mi_sparse_prt.emission.haar import haar_colours, haar_columns, inverse_haar
+from mi_sparse_prt.emission.spherical_harmonics import harmonic_orders, spherical_harmonics
 from mi_sparse_prt.precompute import precompute
 from mi_sparse_prt.relighting.approximations import (
     Approximation,
     Bands,
     Everything,
     Incremental,
+    Linear,
     NonIncremental,
     PerBand,
     wavelet_bands,
@@ -42,6 +44,8 @@ from mi_sparse_prt.validation.validate import save_figures
 
 Floats = NDArray[np.float32]
 Report = dict[str, Any]
+
+ORDER = 24  # of spherical harmonics, up to which they are played: 625
 
 
 @dataclass(frozen=True)
@@ -68,11 +72,37 @@ PAPER = MovingEffort()
 
 @dataclass(frozen=True)
 class _Method:
-    """An approximation and its budget; ``by_image``: wavelets are chosen by the norms of their columns."""
+    """An approximation and its budget, in one of the bases that ``_bases`` makes."""
 
     make: Callable[[Bands], Approximation]
     budget: int
-    by_image: bool = False
+    basis: str = "wavelets"
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """What light and matrix are written in: orthonormal functions, columns of which L~ chooses some.
+
+    Attributes
+    ----------
+    bands : Bands
+    clusters : ClusterColumns
+        Of these functions.
+    functions : (m, k) float32, optional
+        Their wavelet coefficients; None for wavelets themselves.
+    """
+
+    bands: Bands
+    clusters: ClusterColumns
+    functions: Floats | None = None
+
+    def coefficients(self, wavelets: Floats) -> Floats:
+        """Of a light (m, 3)."""
+        return wavelets if self.functions is None else self.functions.T @ wavelets
+
+    def wavelets(self, coefficients: Floats) -> Floats:
+        """Of a light that has these coefficients."""
+        return coefficients if self.functions is None else self.functions @ coefficients
 
 
 METHODS = {
@@ -81,8 +111,11 @@ METHODS = {
     "PBI(30) by band": _Method(lambda bands: PerBand(bands, exhaustive=False), 30),
     "PBI(30)": _Method(PerBand, 30),
     "PBI(100)": _Method(PerBand, 100),
-    "by image(30)": _Method(lambda bands: PerBand(bands, power=2), 30, by_image=True),
-    "by image(100)": _Method(lambda bands: PerBand(bands, power=2), 100, by_image=True),
+    "by image(30)": _Method(lambda bands: PerBand(bands, power=2), 30, "by image"),
+    "by image(100)": _Method(lambda bands: PerBand(bands, power=2), 100, "by image"),
+    **{f"SH({k})": _Method(Linear, k, "harmonics") for k in (36, 100)},
+    "PBI of SH(36)": _Method(lambda bands: PerBand(bands, exhaustive=False), 36, "harmonics"),
+    "all SH": _Method(Everything, 1 << 30, "harmonics"),
 }
 
 
@@ -120,7 +153,7 @@ def measure_moving_light(
     transport = precompute(scene, lighting, target_error=effort.target_error, progress=progress)
     compressed = compress(transport, progress=progress)
     clusters = cluster_columns(compressed.operators["compressed"])  # type: ignore[arg-type]
-    norms = clusters.norms()
+    bases = _bases(clusters, lighting)
     lights = {name: TurningLight(light, lighting) for name, light in environments_of(scene).items()}
     report: Report = report_header(scene, lighting) | {
         "matrix": {
@@ -133,7 +166,7 @@ def measure_moving_light(
     cases = [(name, degrees) for name in lights for degrees in effort.degrees]
     for name, degrees in tqdm(cases, desc="moving light", unit=" turns", disable=not progress):
         frames = list(turning(lights[name], degrees, effort.frames, effort.still))
-        case = _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames)
+        case = _Case(frames, bases, compressed.albedo, lighting, effort.frames)
         report["turning"].setdefault(name, {})[f"{degrees:g}"] = case.measured()
     shown = "sunset" if "sunset" in lights else next(iter(lights))
     other = next((name for name in lights if name != shown), None)
@@ -141,7 +174,7 @@ def measure_moving_light(
     second = lights[shown].exact(180) if other is None else lights[other].exact(0)
     changing = _changing(lights[shown].exact(0), second, lighting, effort)
     report["changing"] = {
-        name: _Case(frames, clusters, compressed.albedo, lighting, norms, effort.frames).measured()
+        name: _Case(frames, bases, compressed.albedo, lighting, effort.frames).measured()
         for name, frames in tqdm(changing.items(), desc="changing light", disable=not progress)
     }
     report["frames"] = measure_frames(transport, compressed, clusters, next(iter(lights.values())), progress)
@@ -152,6 +185,20 @@ def measure_moving_light(
     if figures is not None:
         save_figures(figures, moving_light_figures(report, lights[shown], shown) | pictures)
     return report
+
+
+def _bases(clusters: ClusterColumns, lighting: CubemapLighting) -> dict[str, _Basis]:
+    """By name: wavelets by the area they cover, by what they do to all vertices, and harmonics."""
+    n = lighting.resolution
+    order = min(ORDER, n)
+    functions = haar_columns(spherical_harmonics(lighting, order))
+    harmonics = replace(clusters, columns=functions.T @ clusters.columns)
+    orders = harmonic_orders(order)
+    return {
+        "wavelets": _Basis(wavelet_bands(n), clusters),
+        "by image": _Basis(wavelet_bands(n, clusters.norms()), clusters),
+        "harmonics": _Basis(Bands(orders, np.ones(len(orders), np.float32)), harmonics, functions),
+    }
 
 
 def _changing(
@@ -172,14 +219,13 @@ class _Case:
     def __init__(
         self,
         texels: list[Floats],
-        clusters: ClusterColumns,
+        bases: dict[str, _Basis],
         albedo: Floats,
         lighting: CubemapLighting,
-        norms: Floats,
         turn: int,
     ) -> None:
-        self.texels, self.lighting, self.norms, self.turn = texels, lighting, norms, turn
-        self.albedo, self.clusters = albedo, clusters
+        self.texels, self.lighting, self.turn = texels, lighting, turn
+        self.albedo, self.bases = albedo, bases
         self.scale = np.sqrt(lighting.solid_angles)[:, None]
         self.light: list[Floats] = []
         for k, values in enumerate(texels):
@@ -187,13 +233,12 @@ class _Case:
             self.light.append(
                 self.light[-1] if same else haar_colours(values, np.sqrt(lighting.solid_angles))
             )
-        self.bands = wavelet_bands(lighting.resolution)
-        self.exact = self._images(Everything(self.bands), None, turn)
+        self.exact = self._images()
 
     def measured(self) -> Report:
         """All methods, what a quarter of the weights leaves out, and frames until the error is below others'."""
         methods = {label: self._played(method) for label, method in METHODS.items()}
-        fewer = self._images(Everything(self.bands), None, self.turn, self.clusters.quarter)
+        fewer = self._images(self.bases["wavelets"].clusters.quarter)
         errors = [relative_l2(ours, exact) for ours, exact in zip(fewer, self.exact, strict=True)]
         result: Report = {"methods": methods, "vectors": {"mean": float(np.mean(errors[1:]))}}
         result["stop"] = {
@@ -207,18 +252,19 @@ class _Case:
 
     def _played(self, method: _Method) -> Report:
         """One method: errors of light and image."""
-        bands = wavelet_bands(self.lighting.resolution, self.norms) if method.by_image else self.bands
-        approximation = method.make(bands)
-        playing = ClusteredPlayer(self.clusters, approximation.groups)
+        basis, bands = self.bases[method.basis], self.bases["wavelets"].bands
+        approximation = method.make(basis.bands)
+        playing = ClusteredPlayer(basis.clusters, approximation.groups)
         light, sphere, image, flicker, resets = [], [], [], [], []
         before = np.zeros_like(self.albedo)
-        for k, coefficients in enumerate(self.light):
-            update = approximation.update(coefficients, method.budget if k else None)
-            light.append(weighted_error(approximation, coefficients, self.bands))
+        for k, wavelets in enumerate(self.light):
+            update = approximation.update(basis.coefficients(wavelets), method.budget if k else None)
+            applied = basis.wavelets(approximation.applied)
+            light.append(weighted_error(applied, wavelets, bands))
             resets.append(update.resets.tolist())
             if 0 < k < self.turn:
                 playing.apply(update)
-                sphere.append(self._sphere_error(approximation.applied, self.texels[k]))
+                sphere.append(self._sphere_error(applied, self.texels[k]))
                 wrong = playing.radiance(self.albedo) - self.exact[k]
                 norm = np.linalg.norm(self.exact[k])
                 image.append(float(np.linalg.norm(wrong) / norm))
@@ -236,14 +282,14 @@ class _Case:
             "resets": np.mean(resets[1 : self.turn], axis=0).tolist(),
         }
 
-    def _images(
-        self, approximation: Approximation, budget: int | None, frames: int, vectors: int | None = None
-    ) -> list[Floats]:
-        """Colours of the vertices in the first frames."""
-        playing = ClusteredPlayer(self.clusters, approximation.groups, vectors)
+    def _images(self, vectors: int | None = None) -> list[Floats]:
+        """Colours of the vertices in the frames that change, with all wavelets."""
+        basis = self.bases["wavelets"]
+        everything = Everything(basis.bands)
+        playing = ClusteredPlayer(basis.clusters, everything.groups, vectors)
         images = []
-        for coefficients in self.light[:frames]:
-            playing.apply(approximation.update(coefficients, budget))
+        for coefficients in self.light[: self.turn]:
+            playing.apply(everything.update(coefficients, None))
             images.append(playing.radiance(self.albedo))
         return images
 

@@ -8,6 +8,7 @@ from mi_sparse_prt.cli.pictures import pictures
 from mi_sparse_prt.cli.precompute import precompute
 from mi_sparse_prt.cli.relight import relight
 from mi_sparse_prt.cli.validate import validate
+from mi_sparse_prt.cli.view import view
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -16,5 +17,5 @@ app = typer.Typer(
     help="Precomputed light transport for Mitsuba 3 scenes: compute a matrix once, relight the scene at once.",
     epilog="Start with: mi-sparse-prt precompute SCENE.xml -o SCENE.prt",
 )
-for command in (precompute, relight, validate, info, benchmark, pictures):
+for command in (precompute, relight, view, validate, info, benchmark, pictures):
     app.command()(command)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +18,7 @@ from mi_sparse_prt.cli.files import image_bytes, srgb_pixels
 from mi_sparse_prt.cli.running import Command, check_folder
 from mi_sparse_prt.core.errors import PrtError
 
+ENCODERS = 2  # threads; pictures that wait for them are as many
 DIGITS = 4  # of the names of pictures, at least
 QUALITY = 16  # constant rate factor of H.264: no difference is seen below about 18
 # as ITU-T H.273 numbers them: without them, players guess by the size of the picture
@@ -35,6 +38,8 @@ class Frames(Protocol):
 class FrameFolder:
     """Frames as 0000.png, 0001.png, ... in a folder; each appears whole or not at all.
 
+    They are encoded by other threads, while the next ones are made.
+
     Parameters
     ----------
     command : Command
@@ -43,21 +48,33 @@ class FrameFolder:
     frames : int
         How many there will be.
     exposure : float
-        In stops.
+        In stops, of .png files.
+    suffix : {".png", ".exr"}
     """
 
-    def __init__(self, command: Command, folder: Path, frames: int, exposure: float) -> None:
-        self._command, self._folder, self._exposure = command, folder, exposure
+    def __init__(
+        self, command: Command, folder: Path, frames: int, exposure: float, suffix: str = ".png"
+    ) -> None:
+        self._command, self._folder, self._exposure, self._suffix = command, folder, exposure, suffix
         folder.mkdir(parents=True, exist_ok=True)
-        self._names, self._size = iter(_names(frames)), 0
+        self._names, self._size = iter(_names(frames, suffix)), 0
+        self._encoders, self._encoded = ThreadPoolExecutor(ENCODERS), deque[Future[bytes]]()
 
     def add(self, image: NDArray[np.float32]) -> None:
-        content = image_bytes(image, ".png", self._exposure)
-        self._size += len(content)
-        self._command.write(self._folder / next(self._names), content, part_of=self._folder)
+        self._encoded.append(self._encoders.submit(image_bytes, image, self._suffix, self._exposure))
+        if len(self._encoded) > ENCODERS:
+            self._write()
 
     def finish(self) -> int:
+        while self._encoded:
+            self._write()
+        self._encoders.shutdown()
         return self._size
+
+    def _write(self) -> None:
+        content = self._encoded.popleft().result()
+        self._size += len(content)
+        self._command.write(self._folder / next(self._names), content, part_of=self._folder)
 
 
 class FilmFile:
@@ -111,7 +128,7 @@ class FilmFile:
         return stream
 
 
-def check_frame_folder(folder: Path, frames: int) -> None:
+def check_frame_folder(folder: Path, frames: int, suffix: str = ".png") -> None:
     """Find out before the work whether frames can be written into a folder, which may still have to be made.
 
     Raises
@@ -120,17 +137,17 @@ def check_frame_folder(folder: Path, frames: int) -> None:
         If they cannot, or if the folder holds frames of a longer film, which would follow these.
     """
     check_folder(folder)
-    there = {path.name for path in folder.glob("*.png") if path.stem.isdecimal()}
-    others = there - {*_names(frames)}
+    there = {path.name for path in folder.glob(f"*{suffix}") if path.stem.isdecimal()}
+    others = there - {*_names(frames, suffix)}
     if others:
         raise PrtError(
             f"{folder} has frames of a longer film, such as {min(others)}: remove them or choose another folder"
         )
 
 
-def _names(frames: int) -> list[str]:
+def _names(frames: int, suffix: str) -> list[str]:
     digits = max(DIGITS, len(str(frames - 1)))
-    return [f"{frame:0{digits}}.png" for frame in range(frames)]
+    return [f"{frame:0{digits}}{suffix}" for frame in range(frames)]
 
 
 def new_frames(

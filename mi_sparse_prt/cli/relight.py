@@ -10,7 +10,7 @@ import typer
 
 from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.matrix_file import with_scene
-from mi_sparse_prt.cli.running import running
+from mi_sparse_prt.cli.running import Command, running
 from mi_sparse_prt.cli.tables.written import relighting_table
 from mi_sparse_prt.core.errors import PrtError
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FILM = ".mp4"
 
 EnvironmentFile = Annotated[
-    Path,
+    Path | None,
     options.file_option(
         "--environment", "-e", metavar="ENV", help="Equirectangular HDR image: .exr, .hdr or .pfm."
     ),
@@ -36,7 +36,8 @@ ImageFile = Annotated[
     options.file_option(
         "--output",
         "-o",
-        help="Image to write: .png (sRGB) or .exr (linear). With --frames: a film (.mp4), or a folder for .png files.",
+        help="Image to write: .png (sRGB) or .exr (linear). With --frames: a film (.mp4), or a folder for .png files. "
+        "With --each: a folder.",
     ),
 ]
 VerticesFile = Annotated[
@@ -55,6 +56,15 @@ Exposure = Annotated[
 ]
 FrameCount = Annotated[
     int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
+]
+Each = Annotated[
+    int | None,
+    typer.Option(
+        "--each",
+        metavar="LIGHTS",
+        help="In place of an environment, so many even lights around the scene: a picture (.exr) of each.",
+        show_default=False,
+    ),
 ]
 LastEnvironment = Annotated[
     Path | None,
@@ -99,7 +109,7 @@ class _View:
 
 def relight(
     matrix: options.MatrixFile,
-    environment: EnvironmentFile,
+    environment: EnvironmentFile = None,
     output: ImageFile = None,
     vertices: VerticesFile = None,
     rotate: Rotate = 0.0,
@@ -107,6 +117,7 @@ def relight(
     frames: FrameCount = None,
     to: LastEnvironment = None,
     fps: FrameRate = 30.0,
+    each: Each = None,
     sensor: Sensor = 0,
     spp: Samples = 64,
     scene: MatrixScene = None,
@@ -120,7 +131,19 @@ def relight(
     Example: mi-sparse-prt relight bunny.prt -e scenes_xml/envmaps/city.exr --rotate 90 -o bunny.png
 
     A film: mi-sparse-prt relight bunny.prt -e scenes_xml/envmaps/city.exr --rotate 360 --frames 120 -o bunny.mp4
+
+    One light at a time: mi-sparse-prt relight bunny.prt --each 331 -o bunny_lights
     """
+    if each is not None:
+        _check_each(environment, output, vertices, frames)
+        assert output is not None
+        with running(json_file, quiet) as command:
+            _relight_each(
+                command, (matrix, scene, options.definitions(define)), each, output, (sensor, spp), quiet
+            )
+        return
+    if environment is None:
+        raise typer.BadParameter("no light: give -e ENVIRONMENT, or --each LIGHTS", param_hint="-e")
     if frames is None:
         _check_pictures(output, vertices, to)
     else:
@@ -167,6 +190,32 @@ def relight(
         command.show(relighting_table(title, clock.seconds, sizes))
 
 
+def _relight_each(
+    command: Command,
+    source: tuple[Path, Path | None, dict[str, str]],
+    count: int,
+    folder: Path,
+    camera: tuple[int, int],
+    quiet: bool,
+) -> None:
+    """Pictures of one light at a time; ``source`` is the matrix, its scene if it is given, and its parameters."""
+    from mi_sparse_prt import load_transport
+    from mi_sparse_prt.cli.each_light import SUFFIX, make_pictures_of_each
+    from mi_sparse_prt.cli.film import check_frame_folder
+    from mi_sparse_prt.core.profiling import Stopwatch
+
+    matrix, scene, parameters = source
+    check_frame_folder(folder, count, SUFFIX)
+    clock = Stopwatch()
+    with command.prompt_interrupts(), clock.phase("load"):
+        loaded = with_scene(load_transport(matrix), matrix, scene, parameters)
+    with clock.phase("render"):
+        about = make_pictures_of_each(command, *loaded, count, folder, camera, not quiet)
+    command.report = {"matrix": str(matrix), "each": about, "seconds": clock.report()}
+    title = f"{matrix} by {count} lights, one at a time"
+    command.show(relighting_table(title, clock.seconds, {folder: about["bytes"]}))
+
+
 def _pictures(
     view: _View,
     light: Environment,
@@ -202,6 +251,18 @@ def _check_pictures(output: Path | None, vertices: Path | None, to: Path | None)
         )
     _check_suffix(output, (".png", ".exr"), "-o", "; a film or a folder needs --frames")
     _check_suffix(vertices, (".npy", ".ply"), "--vertices")
+
+
+def _check_each(
+    environment: Path | None, output: Path | None, vertices: Path | None, frames: int | None
+) -> None:
+    for given, name in ((environment, "-e"), (vertices, "--vertices"), (frames, "--frames")):
+        if given is not None:
+            raise typer.BadParameter(
+                f"--each has lights and pictures of its own: leave out {name}", param_hint=name
+            )
+    if output is None or (output.suffix and not output.is_dir()):
+        raise typer.BadParameter("pictures of each light need a folder: give -o FOLDER", param_hint="-o")
 
 
 def _check_film(output: Path | None, vertices: Path | None, frames: int, fps: float) -> None:

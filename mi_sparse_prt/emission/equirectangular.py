@@ -34,6 +34,27 @@ def pixel_solid_angles(height: int, width: int) -> Floats:
     return np.broadcast_to(bands[:, None] * (2 * np.pi / width), (height, width))
 
 
+def resampled(pixels: NDArray[np.floating], height: int, width: int) -> Floats:
+    """Means (height, width, 3) over the pixels of another size, of an image that is constant over each of its own.
+
+    By solid angle: what arrives from the whole sphere stays the same.
+    """
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    rows, columns = pixels.shape[:2]
+    # -cos(polar angle) ascends, and is as even in solid angle as azimuths are
+    heights = (-np.cos(np.pi * np.arange(n + 1) / n) for n in (rows, height))
+    azimuths = (np.arange(n + 1) / n for n in (columns, width))
+    tall = np.tensordot(_shares(*heights), pixels, 1)  # [row, old column, rgb]
+    return np.einsum("cw,rwk->rck", _shares(*azimuths), tall, optimize=True).astype(pixels.dtype)
+
+
+def _shares(old: Floats, new: Floats) -> Floats:
+    """Shares (new, old) that old intervals have in each new one; both by their ends, ascending."""
+    common = np.minimum(new[1:, None], old[1:]) - np.maximum(new[:-1, None], old[:-1])
+    return np.maximum(common, 0) / np.diff(new)[:, None]
+
+
 class Potential:
     """The potential C of an image, ready to be integrated along great arcs.
 

@@ -4,6 +4,7 @@ An approximation knows no matrix. It takes the lighting L of a frame, as coeffic
 budget of coefficients; it keeps L~, what has been applied so far, and says how to go on from there (``Update``).
 
 =====================  ======================================================  =======================
+``Linear``             the coarsest coefficients of L, the same in all frames  LWA, [NRH03]
 ``NonIncremental``     the largest coefficients of L, anew in every frame      NWA, [NRH03]
 ``Incremental``        the largest of L - L~                                   BI, equations 3 to 6
 ``PerBand``            of some bands one, of some the other                    PBI, Figure 6
@@ -160,6 +161,15 @@ class Approximation(ABC):
         return Update(chosen, changes, starts, resets, self.applied)
 
 
+class Linear(Approximation):
+    """The first coefficients in order of bands, whatever the light: what spherical harmonics are used for ([NRH03])."""
+
+    name = "linear"
+
+    def _update(self, light: Floats, budget: int) -> Update:
+        return self._set(light, np.argsort(self.bands.number, kind="stable")[:budget], np.ones(1, np.bool_))
+
+
 class NonIncremental(Approximation):
     """NWA ([NRH03]): in every frame the largest coefficients of the light, and nothing from the frame before."""
 
@@ -236,13 +246,9 @@ class Everything(Approximation):
         return self._everything(light)
 
 
-def weighted_error(approximation: Approximation, light: Floats, bands: Bands | None = None) -> float:
-    """How far L~ is from L, relative: the weighted L1 norm over coefficients ([OBRG06] Figure 7).
-
-    ``bands`` have the weights, if these are not those by which the approximation chooses.
-    """
-    weights = (bands or approximation.bands).weights
-    left, whole = (norms(x, weights).sum(dtype=np.float64) for x in (light - approximation.applied, light))
+def weighted_error(applied: Floats, light: Floats, bands: Bands) -> float:
+    """How far L~ is from L, relative: the weighted L1 norm over coefficients ([OBRG06] Figure 7)."""
+    left, whole = (norms(x, bands.weights).sum(dtype=np.float64) for x in (light - applied, light))
     return float(left / max(whole, 1e-30))
 
 

@@ -8,11 +8,17 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.equirectangular import resampled
 from mi_sparse_prt.relighting.fixed_camera import FixedCamera, stands_for_pictures
 from mi_sparse_prt.relighting.image import render
+from mi_sparse_prt.relighting.light import even_lights
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
+
+TOGETHER = 64  # lights, one at a time, whose products are found at once
 
 Floats = NDArray[np.float32]
 
@@ -61,23 +67,30 @@ def film_images(
         yield camera.image(transport.incident.relight(transport.emission.project(light)), light)
 
 
+def images_one_light_at_a_time(
+    scene: Scene, transport: LightTransport, count: int, sensor: int | mi.Sensor, spp: int
+) -> Iterator[Floats]:
+    """Pictures (height, width, 3), linear RGB, of each of so many ``even_lights`` of radiance 1, without a background.
+
+    Raises
+    ------
+    PrtError
+        If the matrix's light is no cubemap or has fewer texels, or rays go on from what the camera sees (see
+        ``FixedCamera``).
+    """
+    if not isinstance(transport.emission, CubemapLighting):
+        raise PrtError(f"even lights are parts of a cubemap; this matrix has {transport.emission!r}")
+    _, owners = even_lights(transport.emission, count)
+    camera = FixedCamera(scene, transport, sensor, spp)
+    for first in range(0, count, TOGETHER):
+        some = np.arange(first, min(first + TOGETHER, count))
+        lights = (owners[:, None] == some).astype(np.float32)
+        incident = transport.incident.apply(lights)  # [row, channel, light]
+        for k in range(len(some)):
+            yield camera.image(np.broadcast_to(incident[:, :, k], (len(incident), 3)))
+
+
 def _of_one_size(first: Floats, last: Floats) -> tuple[Floats, Floats]:
     """Both images with the rows and columns of the larger one."""
-    rows, columns = np.maximum(first.shape[:2], last.shape[:2])
-    return _resampled(first, rows, columns), _resampled(last, rows, columns)
-
-
-def _resampled(pixels: Floats, rows: int, columns: int) -> Floats:
-    """Means over new pixels of an image that is constant over each of its own: a small sun keeps its power."""
-    if pixels.shape[:2] == (rows, columns):
-        return pixels
-    height, width = pixels.shape[:2]
-    tall = np.tensordot(_overlaps(rows, height), pixels, 1)  # [row, old column, rgb]
-    return np.einsum("cw,rwk->rck", _overlaps(columns, width), tall, optimize=True)
-
-
-def _overlaps(new: int, old: int) -> Floats:
-    """Shares (new, old) that ``old`` equal parts of a line have in each of ``new`` ones."""
-    ends, old_ends = np.arange(new + 1) / new, np.arange(old + 1) / old
-    common = np.minimum(ends[1:, None], old_ends[1:]) - np.maximum(ends[:-1, None], old_ends[:-1])
-    return (new * np.maximum(common, 0)).astype(np.float32)
+    rows, columns = (int(n) for n in np.maximum(first.shape[:2], last.shape[:2]))
+    return resampled(first, rows, columns), resampled(last, rows, columns)

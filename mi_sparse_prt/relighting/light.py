@@ -13,6 +13,7 @@ from functools import cached_property
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cube_faces import FACE_FRAMES, subtexels, texels_towards
@@ -129,6 +130,29 @@ def disc(lighting: CubemapLighting, towards: ArrayLike, degrees: float, radiance
     covered[near] = (inside * parts).sum(axis=1) / parts.sum(axis=1)
     covered *= 2 * np.pi * (1 - np.cos(radius)) / max(covered @ lighting.solid_angles, 1e-30)
     return covered[:, None].astype(np.float32) * np.broadcast_to(np.asarray(radiance, np.float32), 3)
+
+
+def even_lights(lighting: CubemapLighting, count: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Lights all around the scene, that shine one at a time: together they are light of radiance 1 from everywhere.
+
+    Returns
+    -------
+    (count, 3) float64
+        Their directions, world, evenly spread (on a spiral from -y to +y).
+    (n_directions,) int64
+        Which of them each texel belongs to: the nearest.
+
+    Raises
+    ------
+    PrtError
+        If there is none, or there are more than texels.
+    """
+    if not 1 <= count <= lighting.n_directions:
+        raise PrtError(f"{count} lights: give 1 to {lighting.n_directions}, the texels of this cubemap")
+    y = (2 * np.arange(count) + 1) / count - 1
+    phi, radius = np.pi * (3 - 5**0.5) * np.arange(count), np.sqrt(1 - y * y)
+    directions = np.stack([radius * np.sin(phi), y, -radius * np.cos(phi)], axis=1)
+    return directions, cKDTree(directions).query(lighting.directions)[1].astype(np.int64)
 
 
 def _padded(texels: Floats, n: int) -> Floats:

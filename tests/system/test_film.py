@@ -223,3 +223,42 @@ def test_a_folder_that_cannot_be_made_is_refused(film, tmp_path):
         assert result.exit_code == 1
         assert len(result.stderr.splitlines()) == 1
         assert "choose another folder" in result.stderr
+
+
+def test_one_light_at_a_time(folder: Path, tmp_path: Path) -> None:
+    """A picture for each light: its own column sums, and all of them together those of light from everywhere."""
+    report, into = tmp_path / "r.json", tmp_path / "lights"
+    arguments = ("--each", 11, "-o", into, "--spp", 2, "--json", report)
+    assert call("relight", folder / "m.prt", *arguments).exit_code == 0
+    names = [f"{k:04}.exr" for k in range(11)]
+    assert sorted(path.name for path in into.iterdir()) == [*names, "lights.json"]
+    pictures = np.stack([np.array(mi.Bitmap(str(into / name)))[..., :3] for name in names])
+    transport = prt.load_transport(folder / "m.prt")
+    camera = prt.FixedCamera(prt.load_scene(folder / "scene.xml", float("inf")), transport, spp=2)
+    np.testing.assert_allclose(pictures.sum(axis=0), camera.image(transport.irradiance(1.0)), atol=1e-5)
+    about = json.loads((into / "lights.json").read_text())
+    directions = np.array([light["direction"] for light in about["lights"]])
+    nearest = np.argmax(transport.lighting.directions @ directions.T, axis=1)
+    light = np.repeat((nearest == 7)[:, None], 3, axis=1).astype(np.float32)
+    np.testing.assert_allclose(pictures[7], camera.image(transport.irradiance(light)), atol=1e-6)
+    angles = sum(light["solid_angle"] for light in about["lights"])
+    assert abs(angles - 4 * np.pi) < 1e-4
+    found = json.loads(report.read_text())["each"]
+    assert found["pictures"] == 11 and found["bytes"] == sum(p.stat().st_size for p in into.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--each", 5), "folder"),
+        (("--each", 5, "-o", "x.png"), "folder"),
+        (("--each", 5, "-o", "x", "--frames", 3), "leave out --frames"),
+        (("--each", 0, "-o", "x"), "0 lights"),
+        (("--each", 999, "-o", "x"), "999 lights"),
+        (("-o", "x.png"), "no light"),
+    ],
+)
+def test_lights_that_make_no_sense(folder: Path, tmp_path: Path, monkeypatch, arguments, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = call("relight", folder / "m.prt", *arguments)
+    assert done.exit_code != 0 and words in " ".join(done.stderr.split())

@@ -134,6 +134,31 @@ def test_relight_is_linear(transport):
     assert close(both, 0.25 * transport.relight(L1) + 3 * transport.relight(L2))
 
 
+def test_many_lights_are_those_one_by_one(transport):
+    lights = np.random.default_rng(2).random((6 * N * N, 3, 7), dtype=np.float32)
+    expected = np.stack([transport.relight(lights[:, :, k]) for k in range(7)], axis=2)
+    for together in (1, 3, 100):
+        assert close(transport.relight_many(lights, together=together), expected)
+    one_by_one = (lights[:, :, k] for k in range(7))
+    stored, firsts = np.zeros(expected.shape, np.float16), []
+    assert transport.relight_many(one_by_one, stored, 3) is None
+    assert np.allclose(stored, expected, atol=2e-3 * expected.max())
+    transport.relight_many(lights, lambda first, colours: firsts.append((first, colours.shape[2])), 3)
+    assert firsts == [(0, 3), (3, 3), (6, 1)]
+    assert transport.relight_many([]).shape == (N_V, 3, 0)
+
+
+def test_many_lights_that_are_none(transport):
+    lights = np.ones((6 * N * N, 3, 2), np.float32)
+    with pytest.raises(prt.PrtError, match="1 or more"):
+        transport.relight_many(lights, together=0)
+    with pytest.raises(prt.PrtError, match="one after the other"):
+        transport.relight_many(lights[:-1])
+    lights[3, 1, 1] = np.nan
+    with pytest.raises(prt.PrtError, match="NaN"):
+        transport.relight_many(lights)
+
+
 @pytest.mark.parametrize(
     "ids",
     [[3, 1, 2], [3, 3, 3], [-1, 0, -2], 7, np.int64(7), np.arange(5, dtype=np.uint8), range(4), (1, 2)],

@@ -1,0 +1,114 @@
+"""``mi-sparse-prt view``: a matrix in the browser, or as a page in a file."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mi_sparse_prt.cli import options
+from mi_sparse_prt.cli.matrix_file import with_scene
+from mi_sparse_prt.cli.relight import MatrixScene, Sensor
+from mi_sparse_prt.cli.running import Command, running
+from mi_sparse_prt.cli.tables.written import relighting_table
+
+if TYPE_CHECKING:
+    from mi_sparse_prt import Environment, Scene
+
+Environments = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--environment",
+        "-e",
+        metavar="ENV",
+        help="Equirectangular HDR image to choose: .exr, .hdr or .pfm; may be repeated.",
+        show_default="those in the folder envmaps beside the scene; else a sky and a sun",
+    ),
+]
+Export = Annotated[
+    Path | None, options.file_option("--export", help="Write the page (.html), and do not show it.")
+]
+Kept = Annotated[
+    float,
+    typer.Option(help="Share of the wavelet coefficients that the page keeps: its size against its error."),
+]
+Port = Annotated[int, typer.Option(help="Of the page on this machine; 0 for any that is free.")]
+Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")]
+
+
+def view(
+    matrix: options.MatrixFile,
+    environment: Environments = None,
+    export: Export = None,
+    kept: Kept = 0.05,
+    port: Port = 0,
+    browser: Browser = True,
+    sensor: Sensor = 0,
+    scene: MatrixScene = None,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Turn the light of a scene with the mouse: in the browser, or in one HTML file that works without a network.
+
+    Example: mi-sparse-prt view bunny.prt
+
+    To send by mail: mi-sparse-prt view bunny.prt --export bunny.html
+    """
+    if export is not None and export.suffix.lower() not in (".html", ".htm"):
+        raise typer.BadParameter(f"{export}: give a name that ends in .html", param_hint="--export")
+    with running(json_file, quiet, outputs=[export]) as command:
+        from mi_sparse_prt import compress, load_transport
+        from mi_sparse_prt.core.profiling import Stopwatch
+        from mi_sparse_prt.relighting.viewer import make_page
+
+        clock = Stopwatch()
+        with command.prompt_interrupts():
+            with clock.phase("load"):
+                loaded, transport = with_scene(
+                    load_transport(matrix), matrix, scene, options.definitions(define)
+                )
+                lights = _lights(loaded, environment)
+            if "compressed" not in transport.operators:
+                with clock.phase("compress"):
+                    transport = compress(transport, progress=not quiet)
+            with clock.phase("page"):
+                content = make_page(
+                    loaded, transport, lights, kept=kept, sensor=_camera(loaded, sensor), title=matrix.stem
+                )
+        page = content.text.encode()
+        command.report = {"matrix": str(matrix), "bytes": len(page), "notes": content.notes}
+        command.report |= {"environments": list(lights), "kept": kept, "seconds": clock.report()}
+        if export is not None:
+            command.write(export, page)
+            command.show(relighting_table(f"{matrix} as a page", clock.seconds, {export: len(page)}))
+            return
+        _serve(command, page, port, browser)
+
+
+def _lights(scene: Scene, files: list[Path] | None) -> dict[str, Environment]:
+    """Lights by name."""
+    from mi_sparse_prt import load_environment
+    from mi_sparse_prt.benchmark.relit_reference import environments_of
+
+    return {file.stem: load_environment(file) for file in files} if files else environments_of(scene)
+
+
+def _camera(scene: Scene, sensor: int) -> int | None:
+    """The camera that was asked for; None for the first one of a scene that has none."""
+    return None if sensor == 0 and not scene.mitsuba.sensors() else sensor
+
+
+def _serve(command: Command, page: bytes, port: int, browser: bool) -> None:
+    """Show the page until Ctrl-C."""
+    from mi_sparse_prt.relighting.viewer.server import PageServer
+
+    with PageServer(page, port) as server:
+        typer.echo(f"{server.url}  (Ctrl-C ends it)", err=True)
+        command.hint = ": the page is closed"
+        if browser:
+            webbrowser.open(server.url)
+        server.serve_forever()

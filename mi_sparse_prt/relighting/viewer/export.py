@@ -1,0 +1,230 @@
+"""A scene, its matrix and some lights in one file: a page that relights it, in any browser, without a network."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.emission.cubemap import CubemapLighting
+from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.haar import haar_bands, haar_colours
+from mi_sparse_prt.io.atomic import write_atomically
+from mi_sparse_prt.operators.clustered import Clustered
+from mi_sparse_prt.reflection.reflection import Diffuse
+from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
+from mi_sparse_prt.relighting.viewer import page_scene
+from mi_sparse_prt.relighting.viewer.archive import packed
+from mi_sparse_prt.relighting.viewer.truncated_clusters import TruncatedClusters, truncate_clusters
+from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
+
+KEPT = 0.05  # of the wavelet coefficients of all basis vectors, if not given
+TURNS = 8  # azimuths of each environment, whose wavelets say how large those of light are
+SCRIPTS = ("archive", "light", "wavelets", "radiance_file", "camera", "picture", "main")
+MOST = 1 << 16  # columns, and wavelets, that the page can number
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page, and what is in it.
+
+    Attributes
+    ----------
+    text : str
+        HTML.
+    clusters : ClusterColumns
+        What the page plays in place of the matrix's own clusters.
+    notes : tuple of str
+        What it shows otherwise than ``render`` does, a sentence each.
+
+    Notes
+    -----
+    As the last line of a notebook's cell it is shown there.
+    """
+
+    text: str
+    clusters: ClusterColumns
+    notes: tuple[str, ...]
+
+    def save(self, path: str | Path) -> None:
+        """Write the page as a file, whole or not at all.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; nothing is left behind then.
+        """
+
+        def write(temporary: Path) -> None:
+            temporary.write_text(self.text, "utf-8")
+
+        write_atomically(Path(path), write)
+
+    def _repr_html_(self) -> str:
+        """The page itself, in a notebook."""
+        frame = "width: 100%; height: 480px; border: 0"
+        return f'<iframe style="{frame}" srcdoc="{html.escape(self.text)}"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"Page({len(self.text) / 1e6:.1f} MB of HTML)"
+
+
+def make_page(
+    scene: Scene,
+    transport: LightTransport,
+    environments: Mapping[str, Environment],
+    *,
+    kept: float = KEPT,
+    sensor: int | mi.Sensor | None = None,
+    title: str = "light transport",
+) -> Page:
+    """One HTML file that shows a scene under light that turns; it needs WebGL 2, and nothing from a network.
+
+    Parameters
+    ----------
+    scene : Scene
+    transport : LightTransport
+        Of it, compressed by clustered PCA (``prt.compress``), without terms.
+    environments : dict of name to Environment
+        Lights to choose from; the first is shown first.
+    kept : float
+        Share of the wavelet coefficients of basis vectors that the page keeps, above 0 and up to 1: those that matter
+        most for these lights.
+    sensor : int or mi.Sensor, optional
+        The first view; the first sensor if there is one.
+    title : str
+
+    Returns
+    -------
+    Page
+
+    Raises
+    ------
+    PrtError
+        If the matrix is another scene's or not of this kind, there is no light, or ``kept`` makes no sense.
+    """
+    transport = transport.for_scene(scene)
+    operator = _played(transport)
+    if not environments:
+        raise PrtError("a page without light shows nothing: give at least one environment")
+    if not 0 < kept <= 1:
+        raise PrtError(f"kept={kept}: give the share of coefficients to keep, above 0 and up to 1")
+    lighting, clusters = operator.lighting, cluster_columns(operator)
+    if max(clusters.columns.shape) > MOST:
+        raise PrtError(
+            f"{max(clusters.columns.shape)} wavelets or basis vectors are more than a page can number"
+        )
+    bands, sides = haar_bands(lighting.resolution)
+    order = np.argsort(bands, kind="stable")
+    light = expected_sizes(environments, lighting)
+    truncated = truncate_clusters(clusters, kept, light, order)
+    decoded = truncated.decoded()
+    arrays, about = page_scene.geometry(scene)
+    arrays |= _cluster_arrays(truncated) | {
+        "norms": decoded.norms(),
+        "clusterColours": page_scene.cluster_colours(clusters),
+    }
+    arrays |= {
+        f"environment{k}": page_scene.environment_words(light)
+        for k, light in enumerate(environments.values())
+    }
+    if sensor is None and scene.mitsuba.sensors():
+        sensor = 0
+    notes = _notes(scene)
+    header = about | {
+        "resolution": lighting.resolution,
+        "clusters": len(clusters.starts) - 1,
+        "vectors": clusters.sizes.shape[1],
+        "channels": len(clusters.weights),
+        "camera": page_scene.camera(scene, sensor),
+        "exposure": 0,
+        "environments": [
+            {"name": name, "width": 2 * page_scene.HEIGHT, "height": page_scene.HEIGHT}
+            for name in environments
+        ],
+        "notes": notes,
+    }
+    data = packed(header, arrays, frozenset({"triangles", "starts", "order", "labels"}))
+    return Page(_text(title, data), decoded, notes)
+
+
+def expected_sizes(environments: Mapping[str, Environment], lighting: CubemapLighting) -> Floats:
+    """How large wavelet coefficients of these lights are, whichever way they are turned: (m,), the same in a band."""
+    bands = haar_bands(lighting.resolution)[0]
+    squares = np.zeros(bands.max() + 1)
+    for environment in environments.values():
+        for k in range(TURNS):
+            texels = lighting.project(environment.rotated(360 * k / TURNS))
+            wavelets = haar_colours(texels, np.sqrt(lighting.solid_angles, dtype=np.float32))
+            power = np.square(wavelets, dtype=np.float64).sum(axis=1)
+            squares += np.bincount(bands, power) / power.sum()
+    return np.sqrt(squares / np.bincount(bands)).astype(np.float32)[bands]
+
+
+def _played(transport: LightTransport) -> Clustered:
+    """The clusters of a matrix that a page can play."""
+    if transport.measurement.kind != "vertices" or transport.emission.kind != CubemapLighting.kind:
+        raise PrtError("a page shows matrices of vertices and a cubemap, no others")
+    operator = transport.operators.get("compressed")
+    if not isinstance(operator, Clustered):
+        raise PrtError("a page plays clustered PCA: compress the matrix first, prt.compress(transport)")
+    if not isinstance(transport.reflection, Diffuse):
+        raise PrtError("a page shows diffuse matrices: precompute this one without terms")
+    return operator
+
+
+def _notes(scene: Scene) -> tuple[str, ...]:
+    """What the page draws otherwise than ``render``."""
+    names = [k.name for k in scene.materials[: len(scene.fronts)] if k.single_directions]
+    glossy = [k.name for k in scene.materials[: len(scene.fronts)] if k.glossy and not k.single_directions]
+    notes = []
+    if names:
+        notes.append(f"Mirrors, glass and masks are drawn plain: {', '.join(names)}.")
+    if glossy:
+        notes.append(f"Glossy surfaces are drawn as diffuse ones: {', '.join(glossy)}.")
+    return tuple(notes)
+
+
+def _cluster_arrays(truncated: TruncatedClusters) -> dict[str, NDArray[np.generic]]:
+    """Lists of wavelets as gaps, of which 255 stands for itself and more, and all else of the clusters."""
+    layout = truncated.layout
+    labels = np.empty(len(layout.order), np.uint16)
+    labels[layout.order] = np.repeat(np.arange(len(layout.starts) - 1), np.diff(layout.starts))
+    weights = np.empty_like(truncated.weights)
+    weights[:, :, layout.order] = truncated.weights
+    wavelets = truncated.wavelets.astype(np.int64)
+    before = np.concatenate([[-1], wavelets[:-1]])
+    firsts = truncated.starts[:-1][np.diff(truncated.starts) > 0]
+    before[firsts] = -1
+    gaps = wavelets - before - 1
+    more = gaps // 255
+    bytes_of = np.full(int((more + 1).sum()), 255, np.uint8)
+    bytes_of[np.cumsum(more + 1) - 1] = gaps % 255
+    return {
+        "starts": truncated.starts.astype(np.uint32),
+        "gaps": bytes_of,
+        "values": truncated.values,
+        "scales": truncated.scales,
+        "order": truncated.order_of_wavelets.astype(np.uint16),
+        "labels": labels,
+        "weights": weights,
+    }
+
+
+def _text(title: str, data: str) -> str:
+    folder = files(__package__) / "page"
+    script = "\n".join((folder / f"{name}.js").read_text() for name in SCRIPTS)
+    style = (folder / "style.css").read_text()
+    template = Template((folder / "index.html").read_text())
+    return template.substitute(title=html.escape(title), style=style, script=script, data=data)

@@ -1,0 +1,328 @@
+// --- the page
+
+const STILL = 150; // milliseconds after which nothing moves any more
+const PICTURES = 100; // between pictures of the light, while it moves
+const HEIGHT = 128; // pixels of an image that is dropped; larger ones become smaller
+const KINDS = { radiance: 0, light: 1, clusters: 2 };
+
+class Viewer {
+  constructor(scene, picture) {
+    Object.assign(this, { scene, picture, camera: new Camera(scene.camera, Math.hypot(...scene.extent)) });
+    const { arrays } = scene;
+    this.cubemap = new Cubemap(scene.resolution);
+    this.clusters = new Clusters(this.cubemap, {
+      starts: arrays.starts, gaps: arrays.gaps, values: arrays.values, scales: arrays.scales, order: arrays.order,
+    });
+    this.approximation = new Approximation(this.cubemap, arrays.norms);
+    this.environments = scene.environments.map(({ name, width, height }, k) => {
+      const words = arrays[`environment${k}`];
+      return Object.assign(new Environment(name, width, height, decodeShared(words)), { words });
+    });
+    this.texels = new Float32Array(3 * this.cubemap.size);
+    this.light = new Float32Array(3 * this.cubemap.size);
+    this.state = {
+      environment: 0, degrees: 0, exposure: scene.exposure, method: "per_band", budget: 100, colours: "radiance",
+    };
+    this.milliseconds = {};
+    this.changed = true;
+    this.started = this.exact = this.playing = false;
+    this.moved = -1e9;
+  }
+
+  get environment() {
+    return this.environments[this.state.environment];
+  }
+
+  // Change what is seen; names are those of state
+  set(changes) {
+    const before = { ...this.state };
+    Object.assign(this.state, changes);
+    this.state.degrees = ((this.state.degrees % 360) + 360) % 360;
+    if (before.environment !== this.state.environment || before.degrees !== this.state.degrees) this.changed = true;
+    this.touch();
+  }
+
+  touch() {
+    this.moved = performance.now();
+    if (this.onchange) this.onchange();
+  }
+
+  // L of a frame, what of it is applied, and colours of vertices; the first frame is exact, and so is one that stands still
+  relight(method = this.started ? this.state.method : "everything") {
+    const times = [performance.now()], lap = () => times.push(performance.now());
+    this.environment.project(this.cubemap, this.state.degrees, this.texels);
+    this.cubemap.haar(this.texels, this.light);
+    lap();
+    const chosen = this.approximation.update(this.light, method, this.state.budget);
+    lap();
+    this.clusters.apply(this.approximation, this.light, chosen);
+    lap();
+    this.picture.relight(this.clusters.total);
+    lap();
+    ["light", "choice", "sums", "upload"].forEach((name, k) => (this.milliseconds[name] = times[k + 1] - times[k]));
+    this.chosen = chosen.length;
+    this.started = true;
+    this.changed = false;
+    this.exact = method === "everything";
+  }
+
+  draw(smooth = false) {
+    const start = performance.now(), { state } = this;
+    this.picture.draw({
+      camera: this.camera, light: this.environment, degrees: state.degrees, exposure: 2 ** state.exposure,
+      kind: KINDS[state.colours], smooth,
+    });
+    this.milliseconds.draw = performance.now() - start;
+  }
+
+  resize(width, height) {
+    Object.assign(this.picture.canvas, { width, height });
+    this.touch();
+  }
+
+  // All that a frame is made of; whether another is needed
+  frame(now) {
+    const moving = now - this.moved < STILL;
+    if (this.changed) this.relight();
+    else if (!moving && !this.exact) this.relight("everything");
+    this.draw(!moving);
+    return moving;
+  }
+
+  drop(name, image) {
+    const { width, height, values } = shrunk(image, HEIGHT);
+    const environment = Object.assign(new Environment(name, width, height, values), { words: encodeShared(values) });
+    this.environments.push(environment);
+    this.set({ environment: this.environments.length - 1 });
+  }
+
+  get address() {
+    const { environment, degrees, exposure } = this.state;
+    return new URLSearchParams({
+      light: this.environments[environment].name, degrees: +degrees.toFixed(2), exposure: +exposure.toFixed(2), camera: this.camera.state,
+    }).toString();
+  }
+
+  set address(text) {
+    const given = new URLSearchParams(text), changes = {};
+    const environment = this.environments.findIndex(({ name }) => name === given.get("light"));
+    if (environment >= 0) changes.environment = environment;
+    for (const name of ["degrees", "exposure"]) {
+      const value = parseFloat(given.get(name));
+      if (Number.isFinite(value)) changes[name] = value;
+    }
+    if (given.has("camera")) this.camera.state = given.get("camera");
+    this.set(changes);
+  }
+}
+
+// A cubemap of radiance, unfolded: +Y above +Z, -Y below it, -X, +Z, +X, -Z side by side
+function unfold(canvas, texels, n, exposure) {
+  const places = [[2, 1], [0, 1], [1, 0], [1, 2], [1, 1], [3, 1]];
+  Object.assign(canvas, { width: 4 * n, height: 3 * n });
+  const context = canvas.getContext("2d"), image = context.createImageData(4 * n, 3 * n);
+  for (let j = 0; j < 6 * n * n; j++) {
+    const [column, line] = places[Math.floor(j / (n * n))];
+    const to = 4 * ((line * n + (Math.floor(j / n) % n)) * 4 * n + column * n + (j % n));
+    for (let c = 0; c < 3; c++) image.data[to + c] = 255 * Math.min(Math.max(texels[3 * j + c] * exposure, 0), 1) ** (1 / 2.2);
+    image.data[to + 3] = 255;
+  }
+  context.putImageData(image, 0, 0);
+}
+
+function panel(viewer) {
+  const form = document.getElementById("panel"), { elements } = form;
+  const applied = new Float32Array(viewer.texels.length);
+  const list = () =>
+    elements.environment.replaceChildren(...viewer.environments.map(({ name }, k) => new Option(name, k)));
+  list();
+  const show = () => {
+    const { state } = viewer;
+    if (elements.environment.length !== viewer.environments.length) list();
+    for (const name of ["environment", "degrees", "exposure", "method", "colours"]) elements[name].value = state[name];
+    elements.budget.value = Math.log2(state.budget);
+    elements.play.textContent = viewer.playing ? "stop" : "turn";
+  };
+  form.addEventListener("input", ({ target }) => {
+    const value = target.name === "budget" ? Math.round(2 ** target.value) : target.value;
+    viewer.set({ [target.name]: ["method", "colours"].includes(target.name) ? value : +value });
+  });
+  const numbers = document.getElementById("numbers");
+  const pictures = () => {
+    if (form.hidden) return;
+    const { milliseconds, approximation, cubemap, state } = viewer, exposure = 2 ** state.exposure;
+    cubemap.inverse(approximation.applied, applied);
+    unfold(document.getElementById("light"), viewer.texels, cubemap.n, exposure);
+    unfold(document.getElementById("applied"), applied, cubemap.n, exposure);
+    const of = (name) => (milliseconds[name] || 0).toFixed(1);
+    numbers.textContent =
+      `${viewer.chosen} wavelets, ${(100 * approximation.error(viewer.light)).toFixed(2)}% left out\n` +
+      `bands that began anew: ${[...approximation.resets].map((on) => (on ? "●" : "○")).join("")}\n` +
+      `ms: light ${of("light")}, choice ${of("choice")}, sums ${of("sums")}\n` +
+      `upload ${of("upload")}, draw ${of("draw")}; ${viewer.rate ? viewer.rate.toFixed(0) : "–"} frames/s`;
+  };
+  return { form, show, pictures };
+}
+
+function pointers(viewer, canvas) {
+  const held = new Map();
+  let spread = 0;
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    held.set(event.pointerId, event);
+    spread = 0;
+  });
+  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => held.delete(event.pointerId));
+  canvas.addEventListener("pointermove", (event) => {
+    const before = held.get(event.pointerId);
+    if (!before) return;
+    held.set(event.pointerId, event);
+    const across = (event.clientX - before.clientX) / canvas.clientHeight, down = (event.clientY - before.clientY) / canvas.clientHeight;
+    if (held.size === 2) {
+      const [a, b] = [...held.values()], next = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+      if (spread) viewer.camera.dolly(spread / next);
+      spread = next;
+      viewer.touch();
+    } else if (event.shiftKey || before.buttons & 2) viewer.set({ degrees: viewer.state.degrees + 180 * across });
+    else {
+      viewer.camera.orbit(Math.PI * across, Math.PI * down);
+      viewer.touch();
+    }
+  });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    viewer.camera.dolly(1.001 ** event.deltaY);
+    viewer.touch();
+  }, { passive: false });
+}
+
+function say(text) {
+  const sentence = document.getElementById("sentence");
+  sentence.textContent = text;
+  sentence.hidden = !text;
+}
+
+function dropped(viewer) {
+  document.addEventListener("dragover", (event) => event.preventDefault());
+  document.addEventListener("drop", async (event) => {
+    event.preventDefault();
+    const [file] = event.dataTransfer.files;
+    if (file) await openLight(viewer, file);
+  });
+}
+
+async function openLight(viewer, file) {
+  try {
+    if (!/\.hdr$/i.test(file.name)) throw new Error("only .hdr images are read here");
+    viewer.drop(file.name, readRadiance(new Uint8Array(await file.arrayBuffer())));
+    say("");
+  } catch (error) {
+    say(`${file.name}: ${error.message}`);
+  }
+}
+
+function screenshot(viewer) {
+  viewer.draw(true);
+  viewer.picture.canvas.toBlob((blob) => {
+    const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: "picture.png" });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  });
+}
+
+function actions(viewer, form) {
+  const keys = document.getElementById("keys");
+  const all = {
+    play: () => (viewer.playing = !viewer.playing),
+    screenshot: () => screenshot(viewer),
+    home: () => viewer.camera.home(),
+    help: () => (keys.open ? keys.close() : keys.showModal()),
+    panel: () => (form.hidden = !form.hidden),
+    next: () => viewer.set({ environment: (viewer.state.environment + 1) % viewer.environments.length }),
+    left: () => viewer.set({ degrees: viewer.state.degrees - 1 }),
+    right: () => viewer.set({ degrees: viewer.state.degrees + 1 }),
+    brighter: () => viewer.set({ exposure: viewer.state.exposure + 0.25 }),
+    darker: () => viewer.set({ exposure: viewer.state.exposure - 0.25 }),
+  };
+  const byKey = {
+    " ": "play", s: "screenshot", h: "home", "?": "help", p: "panel", n: "next", ArrowLeft: "left", ArrowRight: "right",
+    "+": "brighter", "=": "brighter", "-": "darker",
+  };
+  const act = (name) => {
+    all[name]();
+    viewer.touch();
+  };
+  form.addEventListener("click", ({ target }) => target.type === "button" && act(target.name));
+  document.addEventListener("keydown", (event) => {
+    const name = byKey[event.key];
+    if (!name || event.ctrlKey || event.metaKey || event.target.matches("input, select")) return;
+    event.preventDefault();
+    act(name);
+  });
+}
+
+async function openPage() {
+  const canvas = document.getElementById("view");
+  const scene = await readArchive(document.getElementById("data").textContent);
+  const viewer = new Viewer(scene, new Picture(canvas, scene));
+  document.getElementById("notes").textContent = scene.notes.join(" ");
+  const images = await Promise.all(scene.textures.map(decodedImage));
+  images.forEach((image, k) => viewer.picture.setAlbedo(k, image));
+  viewer.address = location.hash.slice(1);
+  const { form, show, pictures } = panel(viewer);
+  form.hidden = false;
+  pointers(viewer, canvas);
+  dropped(viewer);
+  actions(viewer, form);
+  run(viewer, canvas, show, pictures);
+  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+  canvas.addEventListener("webglcontextrestored", () => {
+    viewer.picture.prepare();
+    images.forEach((image, k) => viewer.picture.setAlbedo(k, image));
+    viewer.picture.relight(viewer.clusters.total);
+    viewer.touch();
+  });
+  return viewer;
+}
+
+async function decodedImage(text) {
+  const image = new Image();
+  image.src = text;
+  await image.decode();
+  return image;
+}
+
+// Frames as long as something moves
+function run(viewer, canvas, show, pictures) {
+  let asked = false, last = 0, drawn = 0;
+  const step = (now) => {
+    asked = false;
+    if (viewer.held) return; // frames are made by whoever holds it
+    if (viewer.playing) viewer.set({ degrees: viewer.state.degrees + Math.min(now - last, 100) * 0.03 });
+    const scale = window.devicePixelRatio || 1, width = Math.round(canvas.clientWidth * scale), height = Math.round(canvas.clientHeight * scale);
+    if (!viewer.pinned && (canvas.width !== width || canvas.height !== height)) viewer.resize(width, height);
+    const more = viewer.picture.gl.isContextLost() ? false : viewer.frame(performance.now());
+    if (more && now > last) viewer.rate = 0.9 * (viewer.rate || 0) + (0.1 * 1000) / (now - last);
+    last = now;
+    if (!more || now - drawn > PICTURES) {
+      drawn = now;
+      show();
+      pictures();
+      if (!more) history.replaceState(null, "", "#" + viewer.address);
+    }
+    if (more) ask();
+  };
+  const ask = () => {
+    if (!asked) requestAnimationFrame(step);
+    asked = true;
+  };
+  viewer.onchange = ask;
+  window.addEventListener("resize", () => viewer.touch());
+  viewer.touch();
+}
+
+window.viewer = openPage().catch((error) => {
+  say(error.message);
+  return null;
+});

@@ -1,0 +1,324 @@
+// --- pictures by WebGL 2: colours of vertices once per light, then triangles and the background
+
+const ROW = 1024; // vertices in a row of a texture
+const HEAD = "#version 300 es\nprecision highp float; precision highp int; precision highp sampler2D;\n";
+
+// irradiance / pi of vertices: clustered PCA's second step, a pixel for each vertex
+const COLOURS = HEAD + `
+precision highp usampler2D; precision highp sampler2DArray;
+uniform usampler2D labels;
+uniform sampler2DArray weights;
+uniform sampler2D coefficients;
+uniform int quads, channels;
+out vec4 colour;
+void main() {
+  ivec2 place = ivec2(gl_FragCoord.xy);
+  int label = int(texelFetch(labels, place, 0).r);
+  vec3 total = texelFetch(coefficients, ivec2(0, label), 0).rgb;
+  for (int k = 0; k < quads; k++) {
+    vec3 parts[4];
+    for (int c = 0; c < 4; c++) parts[c] = texelFetch(coefficients, ivec2(1 + 4 * k + c, label), 0).rgb;
+    for (int channel = 0; channel < channels; channel++) {
+      vec4 w = texelFetch(weights, ivec3(place, channel * quads + k), 0);
+      w *= abs(w);
+      vec3 own = w.x * parts[0] + w.y * parts[1] + w.z * parts[2] + w.w * parts[3];
+      if (channels == 1) total += own; else total[channel] += own[channel];
+    }
+  }
+  colour = vec4(max(total, 0.0), 1.0);
+}`;
+
+const FILL = HEAD + `
+out vec2 place;
+void main() {
+  place = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0;
+  gl_Position = vec4(place, 1.0, 1.0);
+}`;
+
+const TONE = `
+uniform float exposure;
+vec4 shown(vec3 radiance) {
+  vec3 x = clamp(radiance * exposure, 0.0, 1.0);
+  return vec4(mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x)), 1.0);
+}`;
+
+const BACKGROUND = HEAD + TONE + `
+uniform sampler2D environment;
+uniform mat3 towards; // from places of the picture to the frame of the world
+uniform float degrees;
+in vec2 place;
+out vec4 colour;
+void main() {
+  vec3 d = normalize(towards * vec3(place, 1.0));
+  vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307 + degrees / 360.0, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
+  colour = shown(textureLod(environment, uv, 0.0).rgb);
+}`;
+
+const SURFACE = HEAD + `
+uniform sampler2D light;
+uniform mat4 projected;
+uniform vec3 low, extent;
+uniform int kind;
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec3 albedo;
+layout(location = 3) in vec3 cluster;
+layout(location = 4) in vec2 uv;
+out vec3 where, facing, received, reflected;
+out vec2 texcoords;
+void main() {
+  where = low + extent * position;
+  facing = normal;
+  received = kind == 2 ? cluster : texelFetch(light, ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW}), 0).rgb;
+  reflected = kind == 0 ? albedo : vec3(1.0);
+  texcoords = uv;
+  gl_Position = projected * vec4(where, 1.0);
+}`;
+
+const SHADING = HEAD + TONE + `
+uniform sampler2D albedos;
+uniform vec3 eye;
+uniform int textured, back;
+in vec3 where, facing, received, reflected;
+in vec2 texcoords;
+out vec4 colour;
+void main() {
+  bool seen = dot(facing, eye - where) > 0.0;
+  if (back == 1 && !seen) discard;
+  vec3 albedo = textured == 1 ? texture(albedos, texcoords).rgb : reflected;
+  colour = seen ? shown(received * albedo) : vec4(0.0, 0.0, 0.0, 1.0); // one-sided surfaces are black from behind
+}`;
+
+const ATTRIBUTES = [
+  ["positions", "UNSIGNED_SHORT", 3, true],
+  ["normals", "BYTE", 3, true],
+  ["albedo", "UNSIGNED_SHORT", 3, true],
+  ["clusterColours", "UNSIGNED_BYTE", 3, true],
+  ["texcoords", "FLOAT", 2, false],
+];
+
+class Picture {
+  constructor(canvas, scene) {
+    Object.assign(this, { canvas, scene });
+    this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
+    if (!this.gl) throw new Error("This page needs WebGL 2, which this browser does not have or does not allow.");
+    this.prepare();
+  }
+
+  // All that lives on the graphics card; again after it was lost
+  prepare() {
+    const { gl, scene } = this, { arrays } = scene;
+    if (!gl.getExtension("EXT_color_buffer_float"))
+      throw new Error("This page needs float textures (EXT_color_buffer_float), which this graphics card does not have.");
+    this.programs = {
+      colours: this.program(FILL, COLOURS),
+      background: this.program(FILL, BACKGROUND),
+      surface: this.program(SURFACE, SHADING),
+    };
+    const rows = Math.ceil(scene.vertices / ROW), quads = Math.ceil(scene.vectors / 4);
+    this.size = [ROW, rows];
+    this.labels = this.texture(gl.R16UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_SHORT, padded(arrays.labels, ROW * rows));
+    this.weights = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.weights);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA8_SNORM, ROW, rows, quads * scene.channels);
+    for (let layer = 0; layer < quads * scene.channels; layer++) {
+      const own = new Int8Array(4 * ROW * rows), channel = Math.floor(layer / quads), first = (layer % quads) * 4;
+      for (let c = 0; c < 4 && first + c < scene.vectors; c++) {
+        const start = (channel * scene.vectors + first + c) * scene.vertices;
+        for (let k = 0; k < scene.vertices; k++) own[4 * k + c] = arrays.weights[start + k];
+      }
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, ROW, rows, 1, gl.RGBA, gl.BYTE, own);
+    }
+    this.coefficients = this.texture(gl.RGBA32F, scene.vectors + 1, scene.clusters, gl.RGBA, gl.FLOAT, null);
+    this.light = this.texture(gl.RGBA32F, ROW, rows, gl.RGBA, gl.FLOAT, null);
+    this.target = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    this.environments = new Map();
+    this.albedos = scene.textures.map(() => this.texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)));
+    this.smooth = null;
+    this.geometry();
+  }
+
+  geometry() {
+    const { gl, scene } = this;
+    this.surfaces = gl.createVertexArray();
+    gl.bindVertexArray(this.surfaces);
+    ATTRIBUTES.forEach(([name, type, count, normalized], location) => {
+      const values = scene.arrays[name];
+      if (!values || !values.length) return;
+      // rows of 3 small numbers are padded to 4 bytes: what drivers read as it is
+      const own = count === 3 ? quadrupled(values) : values;
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, own, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(location);
+      gl.vertexAttribPointer(location, count, gl[type], normalized, count === 3 ? 4 * own.BYTES_PER_ELEMENT : 0, 0);
+    });
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(scene.arrays.triangles), gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.nothing = gl.createVertexArray();
+  }
+
+  program(vertices, fragments) {
+    const { gl } = this, program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertices], [gl.FRAGMENT_SHADER, fragments]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost())
+      throw new Error("A shader does not compile: " + gl.getProgramInfoLog(program));
+    const uniforms = {};
+    for (let k = 0; k < (gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) || 0); k++) {
+      const { name } = gl.getActiveUniform(program, k);
+      uniforms[name] = gl.getUniformLocation(program, name);
+    }
+    return { program, uniforms };
+  }
+
+  texture(kind, width, height, format, type, values) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage2D(gl.TEXTURE_2D, 0, kind, width, height, 0, format, type, values);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    return texture;
+  }
+
+  // A picture of an environment, made when it is seen first
+  environment(light) {
+    const { gl } = this;
+    if (!this.environments.has(light)) {
+      const texture = this.texture(gl.RGB9_E5, light.width, light.height, gl.RGB, gl.UNSIGNED_INT_5_9_9_9_REV, light.words);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+      this.environments.set(light, texture);
+    }
+    return this.environments.get(light);
+  }
+
+  // An albedo texture that was decoded
+  setAlbedo(number, image) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.albedos[number]);
+    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, false);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  }
+
+  // Colours of vertices from coefficients of clusters (clusters, vectors + 1, 4)
+  relight(total) {
+    const { gl, scene } = this, { program, uniforms } = this.programs.colours;
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, this.coefficients);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, scene.vectors + 1, scene.clusters, gl.RGBA, gl.FLOAT, total);
+    this.bind(0, gl.TEXTURE_2D, this.labels, uniforms.labels);
+    this.bind(1, gl.TEXTURE_2D_ARRAY, this.weights, uniforms.weights);
+    this.bind(2, gl.TEXTURE_2D, this.coefficients, uniforms.coefficients);
+    gl.uniform1i(uniforms.quads, Math.ceil(scene.vectors / 4));
+    gl.uniform1i(uniforms.channels, scene.channels);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.viewport(0, 0, ...this.size);
+    gl.disable(gl.DEPTH_TEST);
+    gl.bindVertexArray(this.nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+
+  bind(unit, kind, texture, uniform) {
+    const { gl } = this;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(kind, texture);
+    gl.uniform1i(uniform, unit);
+    gl.activeTexture(gl.TEXTURE0);
+  }
+
+  // What the camera sees; smooth pictures have four samples in each pixel
+  draw({ camera, light, degrees, exposure, kind, smooth }) {
+    const { gl, canvas } = this, scale = smooth ? 2 : 1, width = scale * canvas.width, height = scale * canvas.height;
+    if (smooth) this.beginSmooth(width, height);
+    gl.viewport(0, 0, width, height);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+    const view = camera.matrices(width / height);
+    this.drawSurfaces(view, exposure, kind);
+    const { program, uniforms } = this.programs.background;
+    gl.useProgram(program);
+    this.bind(0, gl.TEXTURE_2D, this.environment(light), uniforms.environment);
+    gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
+    gl.uniform1f(uniforms.degrees, degrees);
+    gl.uniform1f(uniforms.exposure, exposure);
+    gl.bindVertexArray(this.nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (smooth) this.endSmooth(width, height);
+  }
+
+  drawSurfaces(view, exposure, kind) {
+    const { gl, scene } = this, { program, uniforms } = this.programs.surface;
+    gl.useProgram(program);
+    this.bind(0, gl.TEXTURE_2D, this.light, uniforms.light);
+    gl.uniformMatrix4fv(uniforms.projected, false, view.projected);
+    gl.uniform3fv(uniforms.low, scene.low);
+    gl.uniform3fv(uniforms.extent, scene.extent);
+    gl.uniform3fv(uniforms.eye, view.eye);
+    gl.uniform1f(uniforms.exposure, exposure);
+    gl.uniform1i(uniforms.kind, kind);
+    gl.bindVertexArray(this.surfaces);
+    for (const mesh of scene.meshes) {
+      const textured = mesh.texture !== null && kind === 0;
+      this.bind(1, gl.TEXTURE_2D, textured ? this.albedos[mesh.texture] : this.light, uniforms.albedos);
+      gl.uniform1i(uniforms.textured, textured ? 1 : 0);
+      gl.uniform1i(uniforms.back, mesh.back ? 1 : 0);
+      if (mesh.back) gl.enable(gl.POLYGON_OFFSET_FILL); // it lies where its front lies
+      gl.polygonOffset(-1, -1);
+      gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 4 * mesh.first);
+      gl.disable(gl.POLYGON_OFFSET_FILL);
+    }
+  }
+
+  beginSmooth(width, height) {
+    const { gl } = this;
+    if (!this.smooth || this.smooth.width !== width || this.smooth.height !== height) {
+      if (this.smooth) this.smooth.buffers.forEach((buffer) => gl.deleteRenderbuffer(buffer));
+      const framebuffer = this.smooth ? this.smooth.framebuffer : gl.createFramebuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      const buffers = [[gl.RGBA8, gl.COLOR_ATTACHMENT0], [gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT]].map(([kind, place]) => {
+        const buffer = gl.createRenderbuffer();
+        gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
+        gl.renderbufferStorage(gl.RENDERBUFFER, kind, width, height);
+        gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, buffer);
+        return buffer;
+      });
+      this.smooth = { framebuffer, buffers, width, height };
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.smooth.framebuffer);
+  }
+
+  endSmooth(width, height) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.smooth.framebuffer);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    // linear, at half the size: the mean of 2 x 2
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width / 2, height / 2, gl.COLOR_BUFFER_BIT, gl.LINEAR);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+}
+
+function padded(values, length) {
+  const result = new values.constructor(length);
+  result.set(values);
+  return result;
+}
+
+function quadrupled(values) {
+  const result = new values.constructor((4 * values.length) / 3);
+  for (let k = 0; 3 * k < values.length; k++) for (let c = 0; c < 3; c++) result[4 * k + c] = values[3 * k + c];
+  return result;
+}

@@ -1,0 +1,165 @@
+"""What a page draws: triangles, albedos, cameras and environments, as small arrays."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.equirectangular import resampled
+from mi_sparse_prt.relighting.clusters import ClusterColumns
+from mi_sparse_prt.scene.scene import Mesh, Scene
+
+HEIGHT = 128  # of environments in a page, which are twice as wide: two pixels in a texel of n = 32
+TEXTURE = 512  # pixels along an edge of an albedo texture
+PERSPECTIVE = "PerspectiveCamera", "ThinLensCamera"  # sensors that a page can stand for
+GOLDEN = 0.6180339887498949  # colours of neighbouring clusters differ by this part of the circle of hues
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def geometry(scene: Scene) -> tuple[Arrays, dict[str, Any]]:
+    """Vertices and triangles of all sheets, and what to know of them."""
+    low = scene.positions.min(axis=0)
+    extent = np.maximum(np.ptp(scene.positions, axis=0), 1e-30)
+    places = np.rint((scene.positions - low) / extent * 65535).astype(np.uint16)
+    triangles = [mesh.triangles + mesh.vertices.start for mesh in scene.meshes]
+    counts = np.array([part.size for part in triangles])
+    firsts = np.cumsum(counts) - counts
+    textures, numbers = _textures(scene)
+    meshes = [
+        {"name": m.name, "first": int(a), "count": int(b), "back": k >= len(scene.fronts), "texture": t}
+        for k, (m, a, b, t) in enumerate(zip(scene.meshes, firsts, counts, numbers, strict=True))
+    ]
+    arrays: Arrays = {
+        "positions": places,
+        "normals": np.rint(scene.normals * 127).astype(np.int8),
+        "albedo": np.rint(np.clip(scene.albedo, 0, 1) * 65535).astype(np.uint16),
+        "triangles": np.concatenate(triangles).astype(np.int32),
+    }
+    if textures:
+        arrays["texcoords"] = np.concatenate([_texcoords(scene, mesh) for mesh in scene.meshes])
+    about = {
+        "vertices": len(places),
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "meshes": meshes,
+        "textures": textures,
+    }
+    return arrays, about
+
+
+def cluster_colours(clusters: ClusterColumns) -> NDArray[np.uint8]:
+    """A colour for the cluster of each vertex, (n_v, 3)."""
+    from matplotlib.colors import hsv_to_rgb
+
+    numbers = np.arange(len(clusters.starts) - 1)
+    hues = np.stack([numbers * GOLDEN % 1, 0.45 + 0.3 * (numbers % 2), np.full(len(numbers), 0.9)], axis=1)
+    colours = np.empty((len(clusters.order), 3), np.uint8)
+    of = np.repeat(numbers, np.diff(clusters.starts))
+    colours[clusters.order] = np.rint(255 * np.asarray(hsv_to_rgb(hues))[of])
+    return colours
+
+
+def camera(scene: Scene, sensor: int | mi.Sensor | None) -> dict[str, Any]:
+    """Where a picture is taken from: eye, target, up, and its height at distance 1.
+
+    The sensor's own where it is a perspective one; else all of the scene, from the front.
+    """
+    size = float(np.linalg.norm(np.ptp(scene.positions, axis=0)))
+    found = None if sensor is None else scene.sensor(sensor)
+    if found is None or found.class_name() not in PERSPECTIVE:
+        eye = scene.centre + np.array([0, 0.3, 1.2]) * size
+        return {"eye": eye.tolist(), "target": scene.centre.tolist(), "up": [0, 1, 0], "height": 0.8}
+    ray, _ = found.sample_ray(0, 0.5, mi.Point2f([0.5, 0.5, 0.5], [0.5, 0, 1]), mi.Point2f(0.5))
+    middle, top, bottom = np.array(ray.d).T.astype(np.float64)
+    eye = np.array(ray.o).T.reshape(-1, 3)[0].astype(np.float64)
+    forwards = middle / np.linalg.norm(middle)
+    distance = max(float((scene.centre - eye) @ forwards), 0.1 * size)
+    edges = [d / (d @ forwards) for d in (top, bottom)]
+    height = edges[0] - edges[1]
+    return {
+        "eye": eye.tolist(),
+        "target": (eye + distance * forwards).tolist(),
+        "up": (height / np.linalg.norm(height)).tolist(),
+        "height": float(np.linalg.norm(height)),
+    }
+
+
+def environment_words(environment: Environment, height: int = HEIGHT) -> NDArray[np.uint32]:
+    """Mean radiance of (height, 2 height) pixels, in the world's frame, as RGB9_E5 words of OpenGL."""
+    pixels = _turned_upright(environment, height)
+    scaled = np.clip(pixels, 0, 65408).astype(np.float64)  # the largest of the format
+    exponent = (
+        np.maximum(-16, np.floor(np.log2(np.maximum(scaled.max(axis=-1), 1e-30)))).astype(np.int64) + 16
+    )
+    exponent += np.rint(scaled.max(axis=-1) * 2.0 ** (24 - exponent)) > 511
+    parts = np.rint(scaled * 2.0 ** (24 - exponent)[..., None]).astype(np.uint32)
+    return parts[..., 0] | parts[..., 1] << 9 | parts[..., 2] << 18 | exponent.astype(np.uint32) << 27
+
+
+def _turned_upright(environment: Environment, height: int) -> NDArray[np.floating]:
+    """Radiance (height, 2 height, 3) of an environment in the world's frame: means over pixels."""
+    source = environment.pixels
+    if np.allclose(environment.rotation, np.eye(3), atol=1e-6):
+        return resampled(source, height, 2 * height)
+    squares = 4  # places along the edge of a pixel
+    theta = np.pi * (np.arange(squares * height) + 0.5) / (squares * height)
+    phi = np.pi * (np.arange(2 * squares * height) + 0.5) / (squares * height)
+    x, y, z = np.broadcast_arrays(
+        np.sin(theta)[:, None] * np.sin(phi), np.cos(theta)[:, None], -np.sin(theta)[:, None] * np.cos(phi)
+    )
+    own = np.stack([x, y, z], axis=-1) @ environment.rotation
+    u = np.arctan2(own[..., 0], -own[..., 2]) / (2 * np.pi) % 1
+    v = np.arccos(np.clip(own[..., 1], -1, 1)) / np.pi
+    found = source[
+        np.minimum((v * source.shape[0]).astype(int), source.shape[0] - 1),
+        (u * source.shape[1]).astype(int) % source.shape[1],
+    ]
+    return found.reshape(height, squares, 2 * height, squares, 3).mean(axis=(1, 3))
+
+
+def _textures(scene: Scene) -> tuple[list[str], list[int | None]]:
+    """Albedo textures as images in the page (data:), and the number of each mesh's own."""
+    images: dict[str, int] = {}
+    numbers: list[int | None] = []
+    for mesh, material in zip(scene.meshes, scene.materials, strict=True):
+        shape = scene.mitsuba.shapes()[mesh.shape]
+        if material.constant or not material.diffuse or not shape.has_vertex_texcoords():
+            numbers.append(None)
+            continue
+        image = _albedo_image(material.bsdf, mesh)
+        numbers.append(None if image is None else images.setdefault(image, len(images)))
+    return list(images), numbers
+
+
+def _albedo_image(bsdf: mi.BSDF, mesh: Mesh) -> str | None:
+    """The diffuse reflectance over a square of texture coordinates, as a PNG (data:)."""
+    cells = (np.arange(TEXTURE) + 0.5) / TEXTURE
+    si = dr.zeros(mi.SurfaceInteraction3f, TEXTURE * TEXTURE)
+    v, u = np.meshgrid(cells, cells, indexing="ij")
+    si.uv = mi.Point2f(u.ravel(), v.ravel())
+    si.wi = mi.Vector3f(0, 0, 1)
+    values = np.array(bsdf.eval_diffuse_reflectance(si)).T.reshape(TEXTURE, TEXTURE, 3)
+    if not np.ptp(values.reshape(-1, 3), axis=0).any():
+        return None  # it is colours of vertices or of faces that vary
+    bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
+    stream = mi.MemoryStream()
+    bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(
+        stream, mi.Bitmap.FileFormat.PNG
+    )
+    return "data:image/png;base64," + base64.b64encode(stream.raw_buffer()).decode()
+
+
+def _texcoords(scene: Scene, mesh: Mesh) -> NDArray[np.float32]:
+    shape = scene.mitsuba.shapes()[mesh.shape]
+    own = scene.fronts[mesh.shape].vertices
+    if not shape.has_vertex_texcoords():
+        return np.zeros((mesh.vertices.stop - mesh.vertices.start, 2), np.float32)
+    values = np.array(mi.traverse(shape)["vertex_texcoords"], np.float32).reshape(-1, 2)
+    return values[scene.front_of[mesh.vertices] - own.start]

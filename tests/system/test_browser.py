@@ -1,0 +1,345 @@
+"""Exported pages in a browser (headless Chromium, WebGL by its software renderer), against Python."""
+
+import base64
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import T, build, diffuse, still_life
+from numpy.testing import assert_allclose
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.core.metrics import flip_map, relative_l2
+from mi_sparse_prt.emission.haar import haar_colours
+from mi_sparse_prt.relighting.approximations import (
+    Incremental,
+    NonIncremental,
+    PerBand,
+    wavelet_bands,
+    weighted_error,
+)
+from mi_sparse_prt.relighting.players import ClusteredPlayer
+from mi_sparse_prt.relighting.viewer import make_page
+from mi_sparse_prt.validation.matrix_figures import panels
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: bash .ci/setup")
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not (BROWSER and DRIVER), reason="no chromium or chromedriver: apt-get install both"),
+]
+
+SIZE = 320, 240
+LIGHTING = prt.CubemapLighting(16)
+FLIP = 0.05  # of a picture against Python's own
+
+
+def sky(seed: int, height: int = 64) -> prt.Environment:
+    """A gradient with a few soft lamps."""
+    rng = np.random.default_rng(seed)
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    phi = np.pi * (np.arange(2 * height) + 0.5) / height
+    d = np.stack(
+        np.broadcast_arrays(
+            np.sin(theta)[:, None] * np.sin(phi),
+            np.cos(theta)[:, None],
+            -np.sin(theta)[:, None] * np.cos(phi),
+        ),
+        axis=-1,
+    )
+    pixels = np.full((*d.shape[:2], 3), 0.1) + 0.4 * np.maximum(d[..., 1:2], 0) * [0.5, 0.7, 1.0]
+    for _ in range(4):
+        towards = rng.normal(size=3) + [0, 0.8, 0]
+        lobe = np.exp(20 * (d @ (towards / np.linalg.norm(towards)) - 1))
+        pixels += lobe[..., None] * rng.uniform(0.5, 2, 3)
+    return prt.Environment(pixels.astype(np.float32))
+
+
+LIGHTS = {"first": sky(1), "second": sky(2)}
+
+
+def shapes() -> dict:
+    """The still life, a leaf that is two-sided, and a ball with a texture."""
+    checks = {"type": "checkerboard", "to_uv": T().scale([8, 4, 1])}
+    return still_life(((0.7, 0.6, 0.5), (0.8, 0.3, 0.2), (0.2, 0.4, 0.8))) | {
+        "leaf": {
+            "type": "rectangle",
+            "to_world": T()
+            .translate([0.2, 1.3, -0.4])
+            .rotate([0, 1, 0], 40)
+            .rotate([1, 0, 0], 60)
+            .scale(0.4),
+            "bsdf": {"type": "twosided", "bsdf": diffuse(0.3, 0.7, 0.3)},
+        },
+        "marble": {
+            "type": "sphere",
+            "center": [0.3, 0.25, 0.9],
+            "radius": 0.25,
+            "bsdf": {"type": "diffuse", "reflectance": checks},
+        },
+        "camera": {
+            "type": "perspective",
+            "fov": 45,
+            "to_world": T().look_at(origin=[1.2, 1.9, 3.2], target=[0, 0.5, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}},
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    scene = build(0.15, **shapes())
+    transport = prt.precompute(scene, LIGHTING, method="gather", target_error=0.2, progress=False)
+    transport = prt.compress(transport, progress=False)
+    page = make_page(scene, transport, LIGHTS, kept=0.3)
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    path.write_text(page.text)
+    return scene, transport, page, path
+
+
+def browser(*arguments: str):
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", *arguments):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    driver.set_script_timeout(60)
+    return driver
+
+
+@pytest.fixture(scope="module")
+def driver():
+    opened = browser()
+    yield opened
+    opened.quit()
+
+
+@pytest.fixture
+def page(driver, exported):
+    """The page, just opened, in pictures of a size."""
+    open_page(driver, exported[3])
+    yield driver
+    wrong = [entry["message"] for entry in driver.get_log("browser") if entry["level"] == "SEVERE"]
+    assert wrong == []
+
+
+def open_page(driver, path: Path, address: str = "") -> None:
+    driver.get("about:blank")
+    driver.get(path.as_uri() + address)
+    assert driver.execute_async_script(
+        "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(viewer !== null); });"
+    )
+    driver.execute_script("v.pinned = v.held = true; v.resize(...arguments);", *SIZE)
+
+
+def picture(driver, script: str = "", *arguments) -> np.ndarray:
+    """Pixels (height, width, 3) in sRGB, 0 to 1, after a script."""
+    text = driver.execute_script(
+        script
+        + "; if (v.changed) v.relight('everything'); v.draw(true); return v.picture.canvas.toDataURL('image/png');",
+        *arguments,
+    )
+    stream = mi.MemoryStream()
+    stream.write(base64.b64decode(text.split(",")[1]))
+    stream.seek(0)
+    return np.array(mi.Bitmap(stream))[..., :3].astype(np.float32) / 255
+
+
+def array(driver, name: str) -> np.ndarray:
+    return np.array(driver.execute_script(f"return Array.from(v.{name});"), np.float32)
+
+
+def side_by_side(ours: np.ndarray, theirs: np.ndarray):
+    figure, axes = panels(14, 4, 1, 3)
+    for axis, (title, image) in zip(
+        axes,
+        {"page": ours, "render": theirs, "difference x 5": 5 * np.abs(ours - theirs)}.items(),
+        strict=True,
+    ):
+        axis.imshow(np.clip(image, 0, 1) ** (1 / 2.2))
+        axis.set(title=title)
+    return figure
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def test_a_picture_is_that_of_render(page, exported, artefact):
+    scene, transport, _, _ = exported
+    for name, degrees in (("first", 0.0), ("second", 130.0)):
+        ours = picture(
+            page, "v.set({environment: arguments[0], degrees: arguments[1]})", [*LIGHTS].index(name), degrees
+        )
+        theirs = prt.render(scene, transport, LIGHTS[name].rotated(degrees), 0, 256, progress=False)
+        away = flip_map(np.clip(theirs, 0, 1), linear(ours)).mean()
+        artefact(side_by_side(linear(ours), theirs), name)
+        assert away < FLIP, f"{name}: {away:.4f}"
+        assert relative_l2(linear(ours), np.clip(theirs, 0, 1)) < 0.06
+
+
+def test_turning_and_moving_change_the_picture(page):
+    before = picture(page)
+    assert np.ptp(before) > 0.5
+    for script in (
+        "v.set({degrees: 90})",
+        "v.set({exposure: 1})",
+        "v.set({colours: 'light'})",
+        "v.set({colours: 'clusters'})",
+        "v.set({environment: 1, colours: 'radiance'})",
+        "v.camera.orbit(0.5, 0.2)",
+        "v.camera.dolly(0.7)",
+    ):
+        after = picture(page, script)
+        assert np.abs(after - before).mean() > 0.005, script
+        before = after
+
+
+def test_dragging_and_keys(page):
+    driver, state = page, "return [v.camera.state, v.state.degrees, v.state.exposure]"
+    canvas = driver.find_element("id", "view")
+    actions = webdriver.ActionChains(driver, duration=20)
+    before = driver.execute_script(state)
+    actions.move_to_element(canvas).click_and_hold().move_by_offset(60, 20).release().perform()
+    moved = driver.execute_script(state)
+    assert moved[0] != before[0] and moved[1] == before[1]
+    keys = webdriver.Keys
+    actions = webdriver.ActionChains(driver, duration=20)
+    actions.key_down(keys.SHIFT).move_to_element(canvas).click_and_hold().move_by_offset(
+        60, 0
+    ).release().key_up(keys.SHIFT)
+    actions.send_keys("+").perform()
+    turned = driver.execute_script(state)
+    assert turned[0] == moved[0] and turned[1] != moved[1] and turned[2] == moved[2] + 0.25
+
+
+def test_light_of_the_page_is_the_projection(page):
+    for k, (name, light) in enumerate(LIGHTS.items()):
+        for degrees in (0, 77.5):
+            page.execute_script(f"v.set({{environment: {k}, degrees: {degrees}}}); v.relight('everything')")
+            exact = LIGHTING.project(light.rotated(degrees))
+            assert relative_l2(array(page, "texels").reshape(-1, 3), exact) < 0.01, name
+            wavelets = haar_colours(exact, np.sqrt(LIGHTING.solid_angles, dtype=np.float32))
+            assert relative_l2(array(page, "light").reshape(-1, 3), wavelets) < 0.01
+            assert_allclose(array(page, "light"), array(page, "approximation.applied"))
+
+
+def test_inverse_is_the_inverse(page):
+    page.execute_script(
+        "v.relight('everything'); w = new Float32Array(v.texels.length); v.cubemap.inverse(v.light, w)"
+    )
+    found = np.array(page.execute_script("return Array.from(w)"), np.float32)
+    assert_allclose(found, array(page, "texels"), atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["non_incremental", "incremental", "per_band"])
+def test_choices_and_sums_are_those_of_python(page, exported, method):
+    made = exported[2]
+    bands = wavelet_bands(LIGHTING.resolution, made.clusters.norms())
+    approximation = {
+        "non_incremental": NonIncremental(bands),
+        "incremental": Incremental(bands),
+        "per_band": PerBand(bands, exhaustive=False),
+    }[method]
+    player = ClusteredPlayer(made.clusters, approximation.groups)
+    page.execute_script("v.set({budget: 40, method: arguments[0]})", method)
+    for frame in range(8):
+        how = "v.set({degrees: arguments[0]}); v.relight(...arguments[1])"
+        page.execute_script(how, 12.0 * frame**1.5, [] if frame else ["everything"])
+        light = array(page, "light").reshape(-1, 3)
+        player.apply(approximation.update(light, 40 if frame else None))
+        applied = array(page, "approximation.applied").reshape(-1, 3)
+        assert np.mean((applied != approximation.applied).any(axis=1)) < 0.005  # sizes that are alike
+        area = wavelet_bands(LIGHTING.resolution)
+        ours = page.execute_script("return v.approximation.error(v.light)")
+        assert ours == pytest.approx(weighted_error(approximation.applied, light, area), rel=0.02, abs=1e-6)
+        total = array(page, "clusters.total").reshape(-1, 4)[:, :3]
+        assert relative_l2(total, (applied.T @ made.clusters.columns).T) < 1e-4
+
+
+UNTIL = """
+const [what, milliseconds, done] = arguments, test = new Function("return " + what), start = performance.now();
+const look = () => (test() || performance.now() - start > milliseconds ? done() : setTimeout(look, 20));
+look();
+"""
+
+
+def test_a_light_that_stands_still_is_exact(page):
+    left_out = page.execute_script(
+        "v.held = false; v.set({budget: 5, degrees: 10}); v.relight('everything');"
+        "v.set({degrees: 100}); v.relight(); return v.approximation.error(v.light)"
+    )
+    assert left_out > 0.05
+    page.execute_async_script(UNTIL, "v.exact", 5000)  # frames go on by themselves
+    assert page.execute_script("return v.approximation.error(v.light)") == 0
+    fresh = "v.clusters.sums.forEach((s) => s.fill(0)); v.approximation.applied.fill(0)"
+    kept = array(page, "clusters.total")
+    page.execute_script(fresh + "; v.relight('everything')")
+    assert relative_l2(kept, array(page, "clusters.total")) < 1e-6
+
+
+def radiance_file(pixels: np.ndarray) -> bytes:
+    """An .hdr file with rows that are not runs."""
+    mantissa, exponent = np.frexp(pixels.max(axis=-1))
+    scale = np.where(mantissa > 0, 256 * mantissa / np.maximum(pixels.max(axis=-1), 1e-30), 0)
+    rgbe = np.concatenate([pixels * scale[..., None], exponent[..., None] + 128], axis=-1).astype(np.uint8)
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {pixels.shape[0]} +X {pixels.shape[1]}\n"
+    return head.encode() + rgbe.tobytes()
+
+
+DROP = """
+const [name, bytes, done] = arguments, transfer = new DataTransfer();
+transfer.items.add(new File([new Uint8Array(bytes)], name));
+document.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer }));
+setTimeout(() => done(document.getElementById("sentence").textContent), 500);
+"""
+
+
+def test_a_dropped_image_is_used(page, exported, tmp_path):
+    light = sky(5)
+    assert page.execute_async_script(DROP, "own.hdr", list(radiance_file(light.pixels))) == ""
+    ours = picture(page)
+    theirs = prt.render(exported[0], exported[1], light, 0, 64, progress=False)
+    assert flip_map(np.clip(theirs, 0, 1), linear(ours)).mean() < FLIP
+    mi.Bitmap(light.pixels).write(str(tmp_path / "runs.hdr"))  # Mitsuba's are runs
+    assert page.execute_async_script(DROP, "runs.hdr", list((tmp_path / "runs.hdr").read_bytes())) == ""
+    assert np.abs(picture(page) - ours).mean() < 0.004
+    for name, content, words in (
+        ("a.exr", b"", "only .hdr"),
+        ("a.hdr", b"nothing", "first line"),
+        ("a.hdr", radiance_file(light.pixels)[:-9], "ends too early"),
+        ("a.hdr", radiance_file(light.pixels[:, :9]), "twice as wide"),
+    ):
+        assert words in page.execute_async_script(DROP, name, list(content))
+    assert page.execute_script("return v.environments.length") == 4
+
+
+def test_a_link_shows_the_same(page, exported):
+    moved = picture(page, "v.set({environment: 1, degrees: 200, exposure: 0.5}); v.camera.orbit(0.4, 0.1)")
+    address = page.execute_script("return '#' + v.address")
+    open_page(page, exported[3], address)
+    assert np.abs(picture(page) - moved).mean() < 0.002  # five digits of the camera's place
+
+
+def test_a_lost_context_comes_back(page):
+    before = picture(page)
+    page.execute_script(
+        "v.held = false; w = v.picture.gl.getExtension('WEBGL_lose_context'); w.loseContext()"
+    )
+    page.execute_async_script(
+        "const done = arguments[0]; setTimeout(() => { w.restoreContext(); setTimeout(done, 800); }, 300)"
+    )
+    assert np.abs(picture(page) - before).max() < 0.01
+
+
+def test_without_webgl_there_is_a_sentence(exported):
+    opened = browser("--disable-3d-apis")
+    try:
+        opened.get(exported[3].as_uri())
+        opened.execute_async_script("const done = arguments[0]; window.viewer.then(() => done());")
+        assert "WebGL 2" in opened.find_element("id", "sentence").text
+    finally:
+        opened.quit()
