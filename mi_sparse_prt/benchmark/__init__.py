@@ -5,6 +5,7 @@ from mi_sparse_prt.benchmark.gallery import draw_gallery, save_gallery
 from mi_sparse_prt.benchmark.glossy_transport import measure_glossy
 from mi_sparse_prt.benchmark.method_comparison import measure_methods
 from mi_sparse_prt.benchmark.moving_light import measure_moving_light
+from mi_sparse_prt.benchmark.page_errors import measure_pages
 from mi_sparse_prt.benchmark.plan_choice import measure_plans
 from mi_sparse_prt.benchmark.row_column_choices import measure_choices
 from mi_sparse_prt.benchmark.size_costs import cost_against_size
@@ -20,6 +21,7 @@ __all__ = [
     "measure_glossy",
     "measure_methods",
     "measure_moving_light",
+    "measure_pages",
     "measure_plans",
     "measure_zoo",
     "run_benchmark",

@@ -63,11 +63,15 @@ Moving = Annotated[
     bool,
     typer.Option("--relight", help="Measure errors and times of frames under a light that moves instead."),
 ]
+Pages = Annotated[
+    bool,
+    typer.Option("--pages", help="Measure sizes of pages for a browser against their errors instead."),
+]
 Figures = Annotated[
     Path | None,
     options.file_option(
         metavar="FOLDER",
-        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy, --zoo or --relight "
+        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy, --zoo, --relight or --pages "
         "measures: "
         "PNG files there.",
     ),
@@ -93,6 +97,7 @@ def benchmark(
     glossy: Glossy = False,
     zoo: Zoo = False,
     moving: Moving = False,
+    pages: Pages = False,
     figures: Figures = None,
     edge_length: options.EdgeLength = None,
     define: options.Define = None,
@@ -109,7 +114,8 @@ def benchmark(
     With --plans: how well method "auto" chooses. With --sizes --figures FOLDER: how cost grows.
     With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
     images, its Figures 17 to 19. With --zoo --figures FOLDER: what is compatible, beside Mitsuba's path. With --relight
-    --figures FOLDER: light that moves, Figures 2 to 9 of the paper on temporal coherence.
+    --figures FOLDER: light that moves, Figures 2 to 9 of the paper on temporal coherence. With --pages
+    --figures FOLDER: what truncation costs in a browser.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -123,6 +129,7 @@ def benchmark(
         "--glossy": glossy,
         "--zoo": zoo,
         "--relight": moving,
+        "--pages": pages,
     }
     which = _only_one(asked)
     varied = edge_length is not None or resolution != options.DEFAULT_RESOLUTION or (zoo and bool(define))
@@ -194,5 +201,6 @@ def _measurement(
         "--glossy": (benchmarks.measure_glossy, tables.glossy_tables),
         "--zoo": (benchmarks.measure_zoo, zoo_tables),
         "--relight": (benchmarks.measure_moving_light, moving_light_tables),
+        "--pages": (benchmarks.measure_pages, tables.pages_tables),
     }
     return kinds[which]

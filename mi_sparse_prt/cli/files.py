@@ -11,11 +11,17 @@ from numpy.typing import NDArray
 from mi_sparse_prt.scene.scene import Scene
 
 
-def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float) -> bytes:
-    """A linear RGB image (height, width, 3) as the content of a .png (sRGB, 8 bits) or .exr file."""
+def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float, half: bool = False) -> bytes:
+    """A linear RGB image (height, width, 3) as the content of a .png (sRGB, 8 bits) or .exr file.
+
+    ``half``: the .exr file has 16 bits for a number, and takes a fifth of the time.
+    """
     stream = mi.MemoryStream()
     if suffix == ".exr":
-        mi.Bitmap(np.ascontiguousarray(image)).write(stream, mi.Bitmap.FileFormat.OpenEXR)
+        bitmap = mi.Bitmap(np.ascontiguousarray(image))
+        if half:
+            bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16)
+        bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
     else:
         mi.Bitmap(srgb_pixels(image, exposure)).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())

@@ -50,6 +50,7 @@ class FrameFolder:
     exposure : float
         In stops, of .png files.
     suffix : {".png", ".exr"}
+        .exr files have half floats.
     """
 
     def __init__(
@@ -61,7 +62,9 @@ class FrameFolder:
         self._encoders, self._encoded = ThreadPoolExecutor(ENCODERS), deque[Future[bytes]]()
 
     def add(self, image: NDArray[np.float32]) -> None:
-        self._encoded.append(self._encoders.submit(image_bytes, image, self._suffix, self._exposure))
+        self._encoded.append(
+            self._encoders.submit(image_bytes, image, self._suffix, self._exposure, half=True)
+        )
         if len(self._encoded) > ENCODERS:
             self._write()
 

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.halves import as_floats
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator, multiply_converted
 
@@ -63,7 +64,7 @@ class Clustered(Operator):
 
     def relight(self, lighting: Floats) -> Floats:
         means, products = self._products(lighting)
-        return _relit(self.labels, self.coefficients.astype(np.float32), means, products)
+        return _relit(self.labels, as_floats(self.coefficients), means, products)
 
     def apply(self, x: Floats) -> Floats:
         if np.ndim(x) == 2:  # means and basis vectors meet the vectors once, not once for each channel

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
+from mi_sparse_prt.core.halves import as_floats
 from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_overlapped
 
@@ -304,5 +305,5 @@ def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:
     product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
     block = 2048  # rows at a time
     for a in range(0, len(matrix), block):
-        product[a : a + block] = matrix[a : a + block].astype(np.float32) @ vectors
+        product[a : a + block] = as_floats(matrix[a : a + block]) @ vectors
     return product

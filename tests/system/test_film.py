@@ -120,12 +120,14 @@ def test_one_light_becomes_another(folder, film, tmp_path):
 
 
 def test_a_sun_keeps_its_power_at_any_size():
-    """Sizes that are no multiples of each other: a resampled image has the same integral over its pixels."""
+    """Sizes that are no multiples of each other: a resampled image has the same integral over the sphere."""
     first, last = np.zeros((10, 20, 3), np.float32), np.zeros((7, 15, 3), np.float32)
     last[3, 6] = 100
-    *_, light = film_lights(prt.Environment(first), prt.Environment(last), 0, 2)
+    sun = prt.Environment(last)
+    *_, light = film_lights(prt.Environment(first), sun, 0, 2)
     assert light.pixels.shape == (10, 20, 3)
-    assert light.pixels.mean() == pytest.approx(last.mean(), rel=1e-5)
+    power = [np.einsum("hwc,hw->c", e.pixels, e.solid_angles) for e in (light, sun)]
+    np.testing.assert_allclose(power[0], power[1], rtol=1e-5)
     assert light.pixels.max() <= 100 * (1 + 1e-5)
 
 
@@ -235,12 +237,14 @@ def test_one_light_at_a_time(folder: Path, tmp_path: Path) -> None:
     pictures = np.stack([np.array(mi.Bitmap(str(into / name)))[..., :3] for name in names])
     transport = prt.load_transport(folder / "m.prt")
     camera = prt.FixedCamera(prt.load_scene(folder / "scene.xml", float("inf")), transport, spp=2)
-    np.testing.assert_allclose(pictures.sum(axis=0), camera.image(transport.irradiance(1.0)), atol=1e-5)
+    np.testing.assert_allclose(
+        pictures.sum(axis=0), camera.image(transport.irradiance(1.0)), rtol=2e-3, atol=1e-4
+    )  # half floats
     about = json.loads((into / "lights.json").read_text())
     directions = np.array([light["direction"] for light in about["lights"]])
     nearest = np.argmax(transport.lighting.directions @ directions.T, axis=1)
     light = np.repeat((nearest == 7)[:, None], 3, axis=1).astype(np.float32)
-    np.testing.assert_allclose(pictures[7], camera.image(transport.irradiance(light)), atol=1e-6)
+    np.testing.assert_allclose(pictures[7], camera.image(transport.irradiance(light)), rtol=1e-3, atol=1e-6)
     angles = sum(light["solid_angle"] for light in about["lights"])
     assert abs(angles - 4 * np.pi) < 1e-4
     found = json.loads(report.read_text())["each"]
@@ -252,7 +256,7 @@ def test_one_light_at_a_time(folder: Path, tmp_path: Path) -> None:
     [
         (("--each", 5), "folder"),
         (("--each", 5, "-o", "x.png"), "folder"),
-        (("--each", 5, "-o", "x", "--frames", 3), "leave out --frames"),
+        (("--each", 5, "-o", "x", "--frames", 3), "of its own"),
         (("--each", 0, "-o", "x"), "0 lights"),
         (("--each", 999, "-o", "x"), "999 lights"),
         (("-o", "x.png"), "no light"),

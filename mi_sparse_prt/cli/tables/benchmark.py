@@ -207,3 +207,13 @@ def glossy_tables(report: dict[str, Any]) -> list[Table]:
         new_table(title, ("", "all pairs", "grazing", "peak"), factors),
         glossy_images_table(report["images"], "Images"),
     ]
+
+
+def pages_tables(report: dict[str, Any]) -> list[Table]:
+    """Sizes of pages, and what they leave out."""
+    rows = [
+        (f"{page['kept']:.0%}", byte_count(page["bytes"]), percent(page["mean"]), percent(page["worst"]))
+        for page in report["pages"]
+    ]
+    title = f"Pages; clustered PCA itself is {percent(report['compression_error'])} off"
+    return [new_table(title, ("coefficients kept", "size", "mean error", "worst environment"), rows)]

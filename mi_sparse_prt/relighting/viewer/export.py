@@ -130,11 +130,9 @@ def make_page(
     light = expected_sizes(environments, lighting)
     truncated = truncate_clusters(clusters, kept, light, order)
     decoded = truncated.decoded()
-    arrays, about = page_scene.geometry(scene)
-    arrays |= _cluster_arrays(truncated) | {
-        "norms": decoded.norms(),
-        "clusterColours": page_scene.cluster_colours(clusters),
-    }
+    strips = page_scene.strips(scene)
+    arrays, about = page_scene.geometry(scene, strips)
+    arrays |= _basis_arrays(truncated) | _row_arrays(truncated, strips.order) | {"norms": decoded.norms()}
     arrays |= {
         f"environment{k}": page_scene.environment_words(light)
         for k, light in enumerate(environments.values())
@@ -196,17 +194,11 @@ def _notes(scene: Scene) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _cluster_arrays(truncated: TruncatedClusters) -> dict[str, NDArray[np.generic]]:
-    """Lists of wavelets as gaps, of which 255 stands for itself and more, and all else of the clusters."""
-    layout = truncated.layout
-    labels = np.empty(len(layout.order), np.uint16)
-    labels[layout.order] = np.repeat(np.arange(len(layout.starts) - 1), np.diff(layout.starts))
-    weights = np.empty_like(truncated.weights)
-    weights[:, :, layout.order] = truncated.weights
+def _basis_arrays(truncated: TruncatedClusters) -> dict[str, NDArray[np.generic]]:
+    """Columns of basis vectors: lists of wavelets as gaps, of which 255 stands for itself and more."""
     wavelets = truncated.wavelets.astype(np.int64)
     before = np.concatenate([[-1], wavelets[:-1]])
-    firsts = truncated.starts[:-1][np.diff(truncated.starts) > 0]
-    before[firsts] = -1
+    before[truncated.starts[:-1][np.diff(truncated.starts) > 0]] = -1
     gaps = wavelets - before - 1
     more = gaps // 255
     bytes_of = np.full(int((more + 1).sum()), 255, np.uint8)
@@ -217,8 +209,21 @@ def _cluster_arrays(truncated: TruncatedClusters) -> dict[str, NDArray[np.generi
         "values": truncated.values,
         "scales": truncated.scales,
         "order": truncated.order_of_wavelets.astype(np.uint16),
-        "labels": labels,
-        "weights": weights,
+    }
+
+
+def _row_arrays(truncated: TruncatedClusters, order: NDArray[np.int64]) -> dict[str, NDArray[np.generic]]:
+    """Clusters and weights of the vertices, which come in an order."""
+    layout = truncated.layout
+    labels = np.empty(len(order), np.uint16)
+    labels[layout.order] = np.repeat(np.arange(len(layout.starts) - 1), np.diff(layout.starts))
+    weights = np.empty_like(truncated.weights)
+    weights[:, :, layout.order] = truncated.weights
+    colours = page_scene.cluster_colours(len(layout.starts) - 1)
+    return {
+        "labels": labels[order],
+        "weights": weights[:, :, order],
+        "clusterColours": colours[labels[order]],
     }
 
 

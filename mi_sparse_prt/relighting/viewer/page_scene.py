@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -10,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.emission.equirectangular import resampled
-from mi_sparse_prt.relighting.clusters import ClusterColumns
 from mi_sparse_prt.scene.scene import Mesh, Scene
 
 HEIGHT = 128  # of environments in a page, which are twice as wide: two pixels in a texel of n = 32
@@ -23,13 +24,46 @@ GOLDEN = 0.6180339887498949  # colours of neighbouring clusters differ by this p
 Arrays = dict[str, NDArray[Any]]
 
 
-def geometry(scene: Scene) -> tuple[Arrays, dict[str, Any]]:
+@dataclass(frozen=True)
+class Strips:
+    """Triangles in an order in which each has vertices of those before it, and vertices in the order of their use.
+
+    Graphics cards keep the last few vertices; and numbers that differ little from those before them are stored in less.
+
+    Attributes
+    ----------
+    triangles : (n_t, 3) int32
+        Of all sheets, one mesh after the other.
+    order : (n_v,) int64
+        Which of the scene's vertices each vertex of these is.
+    """
+
+    triangles: NDArray[np.int32]
+    order: NDArray[np.int64]
+
+
+def strips(scene: Scene) -> Strips:
+    """Triangles along a space-filling curve."""
+    parts = [_along_curve(scene, mesh.triangles + mesh.vertices.start) for mesh in scene.meshes]
+    triangles = np.concatenate(parts)
+    used, first = np.unique(triangles, return_index=True)
+    order = np.concatenate([used[np.argsort(first)], np.setdiff1d(np.arange(scene.n_vertices), used)])
+    numbers = np.empty(len(order), np.int32)
+    numbers[order] = np.arange(len(order), dtype=np.int32)
+    return Strips(numbers[triangles], order)
+
+
+def _along_curve(scene: Scene, triangles: NDArray[np.integer]) -> NDArray[np.integer]:
+    centres = scene.normalised_positions[triangles].mean(axis=1)
+    return triangles[morton_order(centres, np.arange(len(triangles), dtype=np.uint64))]
+
+
+def geometry(scene: Scene, own: Strips) -> tuple[Arrays, dict[str, Any]]:
     """Vertices and triangles of all sheets, and what to know of them."""
     low = scene.positions.min(axis=0)
     extent = np.maximum(np.ptp(scene.positions, axis=0), 1e-30)
     places = np.rint((scene.positions - low) / extent * 65535).astype(np.uint16)
-    triangles = [mesh.triangles + mesh.vertices.start for mesh in scene.meshes]
-    counts = np.array([part.size for part in triangles])
+    counts = np.array([mesh.triangles.size for mesh in scene.meshes])
     firsts = np.cumsum(counts) - counts
     textures, numbers = _textures(scene)
     meshes = [
@@ -37,13 +71,13 @@ def geometry(scene: Scene) -> tuple[Arrays, dict[str, Any]]:
         for k, (m, a, b, t) in enumerate(zip(scene.meshes, firsts, counts, numbers, strict=True))
     ]
     arrays: Arrays = {
-        "positions": places,
-        "normals": np.rint(scene.normals * 127).astype(np.int8),
-        "albedo": np.rint(np.clip(scene.albedo, 0, 1) * 65535).astype(np.uint16),
-        "triangles": np.concatenate(triangles).astype(np.int32),
+        "positions": places[own.order],
+        "normals": np.rint(scene.normals * 127).astype(np.int8)[own.order],
+        "albedo": np.rint(np.clip(scene.albedo, 0, 1) * 65535).astype(np.uint16)[own.order],
+        "triangles": own.triangles,
     }
     if textures:
-        arrays["texcoords"] = np.concatenate([_texcoords(scene, mesh) for mesh in scene.meshes])
+        arrays["texcoords"] = np.concatenate([_texcoords(scene, mesh) for mesh in scene.meshes])[own.order]
     about = {
         "vertices": len(places),
         "low": low.tolist(),
@@ -54,16 +88,13 @@ def geometry(scene: Scene) -> tuple[Arrays, dict[str, Any]]:
     return arrays, about
 
 
-def cluster_colours(clusters: ClusterColumns) -> NDArray[np.uint8]:
-    """A colour for the cluster of each vertex, (n_v, 3)."""
+def cluster_colours(count: int) -> NDArray[np.uint8]:
+    """Colours (count, 3) that tell neighbours apart."""
     from matplotlib.colors import hsv_to_rgb
 
-    numbers = np.arange(len(clusters.starts) - 1)
-    hues = np.stack([numbers * GOLDEN % 1, 0.45 + 0.3 * (numbers % 2), np.full(len(numbers), 0.9)], axis=1)
-    colours = np.empty((len(clusters.order), 3), np.uint8)
-    of = np.repeat(numbers, np.diff(clusters.starts))
-    colours[clusters.order] = np.rint(255 * np.asarray(hsv_to_rgb(hues))[of])
-    return colours
+    numbers = np.arange(count)
+    hues = np.stack([numbers * GOLDEN % 1, 0.45 + 0.3 * (numbers % 2), np.full(count, 0.9)], axis=1)
+    return np.rint(255 * np.asarray(hsv_to_rgb(hues))).astype(np.uint8)
 
 
 def camera(scene: Scene, sensor: int | mi.Sensor | None) -> dict[str, Any]:

@@ -4,26 +4,30 @@ const ROW = 1024; // vertices in a row of a texture
 const HEAD = "#version 300 es\nprecision highp float; precision highp int; precision highp sampler2D;\n";
 
 // irradiance / pi of vertices: clustered PCA's second step, a pixel for each vertex
-const COLOURS = HEAD + `
+const COLOURS = `
 precision highp usampler2D; precision highp sampler2DArray;
 uniform usampler2D labels;
 uniform sampler2DArray weights;
 uniform sampler2D coefficients;
-uniform int quads, channels;
 out vec4 colour;
 void main() {
   ivec2 place = ivec2(gl_FragCoord.xy);
   int label = int(texelFetch(labels, place, 0).r);
   vec3 total = texelFetch(coefficients, ivec2(0, label), 0).rgb;
-  for (int k = 0; k < quads; k++) {
-    vec3 parts[4];
-    for (int c = 0; c < 4; c++) parts[c] = texelFetch(coefficients, ivec2(1 + 4 * k + c, label), 0).rgb;
-    for (int channel = 0; channel < channels; channel++) {
-      vec4 w = texelFetch(weights, ivec3(place, channel * quads + k), 0);
-      w *= abs(w);
-      vec3 own = w.x * parts[0] + w.y * parts[1] + w.z * parts[2] + w.w * parts[3];
-      if (channels == 1) total += own; else total[channel] += own[channel];
-    }
+  for (int k = 0; k < QUADS; k++) {
+    vec3 a = texelFetch(coefficients, ivec2(1 + 4 * k, label), 0).rgb, b = texelFetch(coefficients, ivec2(2 + 4 * k, label), 0).rgb;
+    vec3 c = texelFetch(coefficients, ivec2(3 + 4 * k, label), 0).rgb, d = texelFetch(coefficients, ivec2(4 + 4 * k, label), 0).rgb;
+    vec4 w = texelFetch(weights, ivec3(place, k), 0);
+    w *= abs(w);
+    vec3 own = w.x * a + w.y * b + w.z * c + w.w * d;
+#if CHANNELS == 3
+    total.r += own.r;
+    vec4 green = texelFetch(weights, ivec3(place, QUADS + k), 0), blue = texelFetch(weights, ivec3(place, 2 * QUADS + k), 0);
+    total.g += dot(green * abs(green), vec4(a.g, b.g, c.g, d.g));
+    total.b += dot(blue * abs(blue), vec4(a.b, b.b, c.b, d.b));
+#else
+    total += own;
+#endif
   }
   colour = vec4(max(total, 0.0), 1.0);
 }`;
@@ -35,11 +39,13 @@ void main() {
   gl_Position = vec4(place, 1.0, 1.0);
 }`;
 
+// sRGB by square roots, to within 1e-4 of its powers (least squares), which take twice as long without a graphics card
 const TONE = `
 uniform float exposure;
 vec4 shown(vec3 radiance) {
-  vec3 x = clamp(radiance * exposure, 0.0, 1.0);
-  return vec4(mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x)), 1.0);
+  vec3 x = clamp(radiance * exposure, 0.0, 1.0), a = sqrt(x), b = sqrt(a), c = sqrt(b);
+  vec3 curve = 0.64456067 * a + 0.70994555 * b - 0.33605156 * c - 0.01848596 * x;
+  return vec4(mix(12.92 * x, curve, step(0.0031308, x)), 1.0);
 }`;
 
 const BACKGROUND = HEAD + TONE + `
@@ -54,41 +60,54 @@ void main() {
   colour = shown(textureLod(environment, uv, 0.0).rgb);
 }`;
 
-const SURFACE = HEAD + `
+// few numbers from vertex to pixel: software renderers take as long for these as for the pixels
+const SURFACE = `
 uniform sampler2D light;
 uniform mat4 projected;
-uniform vec3 low, extent;
+uniform vec3 low, extent, eye;
 uniform int kind;
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 2) in vec3 albedo;
 layout(location = 3) in vec3 cluster;
+out float seen;
+out vec3 radiance;
+#ifdef TEXTURED
 layout(location = 4) in vec2 uv;
-out vec3 where, facing, received, reflected;
 out vec2 texcoords;
+#endif
 void main() {
-  where = low + extent * position;
-  facing = normal;
-  received = kind == 2 ? cluster : texelFetch(light, ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW}), 0).rgb;
-  reflected = kind == 0 ? albedo : vec3(1.0);
+  vec3 where = low + extent * position;
+  seen = dot(normal, eye - where);
+  radiance = kind == 2 ? cluster : texelFetch(light, ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW}), 0).rgb;
+#ifdef TEXTURED
   texcoords = uv;
+#else
+  if (kind == 0) radiance *= albedo;
+#endif
   gl_Position = projected * vec4(where, 1.0);
 }`;
 
-const SHADING = HEAD + TONE + `
-uniform sampler2D albedos;
-uniform vec3 eye;
-uniform int textured, back;
-in vec3 where, facing, received, reflected;
-in vec2 texcoords;
+const SHADING = TONE + `
+uniform int back;
+in float seen;
+in vec3 radiance;
 out vec4 colour;
+#ifdef TEXTURED
+uniform sampler2D albedos;
+in vec2 texcoords;
+#endif
 void main() {
-  bool seen = dot(facing, eye - where) > 0.0;
-  if (back == 1 && !seen) discard;
-  vec3 albedo = textured == 1 ? texture(albedos, texcoords).rgb : reflected;
-  colour = seen ? shown(received * albedo) : vec4(0.0, 0.0, 0.0, 1.0); // one-sided surfaces are black from behind
+  if (back == 1 && seen <= 0.0) discard;
+#ifdef TEXTURED
+  vec3 leaving = radiance * texture(albedos, texcoords).rgb;
+#else
+  vec3 leaving = radiance;
+#endif
+  colour = seen > 0.0 ? shown(leaving) : vec4(0.0, 0.0, 0.0, 1.0); // one-sided surfaces are black from behind
 }`;
 
+const CLUSTER = 3; // the attribute that is read for colours of clusters alone
 const ATTRIBUTES = [
   ["positions", "UNSIGNED_SHORT", 3, true],
   ["normals", "BYTE", 3, true],
@@ -111,9 +130,10 @@ class Picture {
     if (!gl.getExtension("EXT_color_buffer_float"))
       throw new Error("This page needs float textures (EXT_color_buffer_float), which this graphics card does not have.");
     this.programs = {
-      colours: this.program(FILL, COLOURS),
+      colours: this.program(FILL, `${HEAD}#define QUADS ${Math.ceil(scene.vectors / 4)}\n#define CHANNELS ${scene.channels}\n${COLOURS}`),
       background: this.program(FILL, BACKGROUND),
-      surface: this.program(SURFACE, SHADING),
+      plain: this.program(HEAD + SURFACE, HEAD + SHADING),
+      textured: this.program(`${HEAD}#define TEXTURED\n${SURFACE}`, `${HEAD}#define TEXTURED\n${SHADING}`),
     };
     const rows = Math.ceil(scene.vertices / ROW), quads = Math.ceil(scene.vectors / 4);
     this.size = [ROW, rows];
@@ -221,8 +241,6 @@ class Picture {
     this.bind(0, gl.TEXTURE_2D, this.labels, uniforms.labels);
     this.bind(1, gl.TEXTURE_2D_ARRAY, this.weights, uniforms.weights);
     this.bind(2, gl.TEXTURE_2D, this.coefficients, uniforms.coefficients);
-    gl.uniform1i(uniforms.quads, Math.ceil(scene.vectors / 4));
-    gl.uniform1i(uniforms.channels, scene.channels);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.viewport(0, 0, ...this.size);
     gl.disable(gl.DEPTH_TEST);
@@ -261,26 +279,33 @@ class Picture {
   }
 
   drawSurfaces(view, exposure, kind) {
-    const { gl, scene } = this, { program, uniforms } = this.programs.surface;
-    gl.useProgram(program);
-    this.bind(0, gl.TEXTURE_2D, this.light, uniforms.light);
-    gl.uniformMatrix4fv(uniforms.projected, false, view.projected);
-    gl.uniform3fv(uniforms.low, scene.low);
-    gl.uniform3fv(uniforms.extent, scene.extent);
-    gl.uniform3fv(uniforms.eye, view.eye);
-    gl.uniform1f(uniforms.exposure, exposure);
-    gl.uniform1i(uniforms.kind, kind);
+    const { gl, scene } = this;
     gl.bindVertexArray(this.surfaces);
-    for (const mesh of scene.meshes) {
-      const textured = mesh.texture !== null && kind === 0;
-      this.bind(1, gl.TEXTURE_2D, textured ? this.albedos[mesh.texture] : this.light, uniforms.albedos);
-      gl.uniform1i(uniforms.textured, textured ? 1 : 0);
-      gl.uniform1i(uniforms.back, mesh.back ? 1 : 0);
-      if (mesh.back) gl.enable(gl.POLYGON_OFFSET_FILL); // it lies where its front lies
-      gl.polygonOffset(-1, -1);
-      gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 4 * mesh.first);
-      gl.disable(gl.POLYGON_OFFSET_FILL);
+    if (kind === 2) gl.enableVertexAttribArray(CLUSTER);
+    else gl.disableVertexAttribArray(CLUSTER);
+    for (const name of ["plain", "textured"]) {
+      const { program, uniforms } = this.programs[name];
+      gl.useProgram(program);
+      this.bind(0, gl.TEXTURE_2D, this.light, uniforms.light);
+      gl.uniformMatrix4fv(uniforms.projected, false, view.projected);
+      gl.uniform3fv(uniforms.low, scene.low);
+      gl.uniform3fv(uniforms.extent, scene.extent);
+      gl.uniform3fv(uniforms.eye, view.eye);
+      gl.uniform1f(uniforms.exposure, exposure);
+      gl.uniform1i(uniforms.kind, kind);
+      for (const mesh of scene.meshes)
+        if ((mesh.texture !== null && kind === 0) === (name === "textured")) this.drawMesh(mesh, uniforms);
     }
+  }
+
+  drawMesh(mesh, uniforms) {
+    const { gl } = this;
+    if (uniforms.albedos) this.bind(1, gl.TEXTURE_2D, this.albedos[mesh.texture], uniforms.albedos);
+    gl.uniform1i(uniforms.back, mesh.back ? 1 : 0);
+    if (mesh.back) gl.enable(gl.POLYGON_OFFSET_FILL); // it lies where its front lies
+    gl.polygonOffset(-1, -1);
+    gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 4 * mesh.first);
+    gl.disable(gl.POLYGON_OFFSET_FILL);
   }
 
   beginSmooth(width, height) {
