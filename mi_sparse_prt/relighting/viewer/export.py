@@ -148,8 +148,13 @@ def make_page(
         "camera": page_scene.camera(scene, sensor),
         "exposure": 0,
         "environments": [
-            {"name": name, "width": 2 * page_scene.HEIGHT, "height": page_scene.HEIGHT}
-            for name in environments
+            {
+                "name": name,
+                "width": 2 * page_scene.HEIGHT,
+                "height": page_scene.HEIGHT,
+                "background": page_scene.background(environment),
+            }
+            for name, environment in environments.items()
         ],
         "notes": notes,
     }

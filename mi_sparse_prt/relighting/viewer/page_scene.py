@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from mi_sparse_prt.emission.equirectangular import resampled
 from mi_sparse_prt.scene.scene import Mesh, Scene
 
 HEIGHT = 128  # of environments in a page, which are twice as wide: two pixels in a texel of n = 32
+SHARPEST = 512  # rows of a background, at most
+QUALITY = 98  # of its JPEG
 TEXTURE = 512  # pixels along an edge of an albedo texture
 PERSPECTIVE = "PerspectiveCamera", "ThinLensCamera"  # sensors that a page can stand for
 GOLDEN = 0.6180339887498949  # colours of neighbouring clusters differ by this part of the circle of hues
@@ -134,6 +137,23 @@ def environment_words(environment: Environment, height: int = HEIGHT) -> NDArray
     return parts[..., 0] | parts[..., 1] << 9 | parts[..., 2] << 18 | exponent.astype(np.uint32) << 27
 
 
+def background(environment: Environment) -> str:
+    """What the camera sees of an environment, sharper than its light: a JPEG (data:) of radiance up to 1."""
+    height = min(environment.pixels.shape[0], SHARPEST)
+    pixels = np.clip(_turned_upright(environment, height), 0, 1)
+    return _image_url(pixels, "jpeg", quality=QUALITY, subsampling=0)  # colours as sharp as brightness
+
+
+def _image_url(pixels: NDArray[np.floating], kind: str, **options: Any) -> str:
+    """A linear RGB image as one of 8 bits (data:)."""
+    from PIL import Image
+
+    bitmap, stream = mi.Bitmap(np.ascontiguousarray(pixels, np.float32)), io.BytesIO()
+    srgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    Image.fromarray(np.array(srgb)).save(stream, kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(stream.getvalue()).decode()
+
+
 def _turned_upright(environment: Environment, height: int) -> NDArray[np.floating]:
     """Radiance (height, 2 height, 3) of an environment in the world's frame: means over pixels."""
     source = environment.pixels
@@ -179,12 +199,7 @@ def _albedo_image(bsdf: mi.BSDF, mesh: Mesh) -> str | None:
     values = np.array(bsdf.eval_diffuse_reflectance(si)).T.reshape(TEXTURE, TEXTURE, 3)
     if not np.ptp(values.reshape(-1, 3), axis=0).any():
         return None  # it is colours of vertices or of faces that vary
-    bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
-    stream = mi.MemoryStream()
-    bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(
-        stream, mi.Bitmap.FileFormat.PNG
-    )
-    return "data:image/png;base64," + base64.b64encode(stream.raw_buffer()).decode()
+    return _image_url(values, "png", optimize=True)
 
 
 def _texcoords(scene: Scene, mesh: Mesh) -> NDArray[np.float32]:

@@ -14,9 +14,9 @@ class Viewer {
       starts: arrays.starts, gaps: arrays.gaps, values: arrays.values, scales: arrays.scales, order: arrays.order,
     });
     this.approximation = new Approximation(this.cubemap, arrays.norms);
-    this.environments = scene.environments.map(({ name, width, height }, k) => {
+    this.environments = scene.environments.map(({ name, width, height, image }, k) => {
       const words = arrays[`environment${k}`];
-      return Object.assign(new Environment(name, width, height, decodeShared(words)), { words });
+      return Object.assign(new Environment(name, width, height, decodeShared(words)), { words, image });
     });
     this.texels = new Float32Array(3 * this.cubemap.size);
     this.light = new Float32Array(3 * this.cubemap.size);
@@ -265,10 +265,10 @@ function actions(viewer, form) {
 async function openPage() {
   const canvas = document.getElementById("view");
   const scene = await readArchive(document.getElementById("data").textContent);
+  scene.images = await Promise.all(scene.textures.map(decodedImage));
+  await Promise.all(scene.environments.map(async (light) => (light.image = await decodedImage(light.background))));
   const viewer = new Viewer(scene, new Picture(canvas, scene));
   document.getElementById("notes").textContent = scene.notes.join(" ");
-  const images = await Promise.all(scene.textures.map(decodedImage));
-  images.forEach((image, k) => viewer.picture.setAlbedo(k, image));
   viewer.address = location.hash.slice(1);
   const { form, show, pictures } = panel(viewer);
   form.hidden = false;
@@ -279,7 +279,6 @@ async function openPage() {
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
     viewer.picture.prepare();
-    images.forEach((image, k) => viewer.picture.setAlbedo(k, image));
     viewer.picture.relight(viewer.clusters.total);
     viewer.touch();
   });

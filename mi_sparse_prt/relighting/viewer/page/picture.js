@@ -49,7 +49,8 @@ vec4 shown(vec3 radiance) {
 }`;
 
 const BACKGROUND = HEAD + TONE + `
-uniform sampler2D environment;
+uniform sampler2D environment, sharp;
+uniform int sharper;
 uniform mat3 towards; // from places of the picture to the frame of the world
 uniform float degrees;
 in vec2 place;
@@ -57,7 +58,12 @@ out vec4 colour;
 void main() {
   vec3 d = normalize(towards * vec3(place, 1.0));
   vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307 + degrees / 360.0, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
-  colour = shown(textureLod(environment, uv, 0.0).rgb);
+  vec3 radiance = textureLod(environment, uv, 0.0).rgb;
+  if (sharper == 1) { // but where it is too bright for an image of 8 bits
+    vec3 image = textureLod(sharp, uv, 0.0).rgb;
+    radiance = mix(image, max(radiance, image), step(0.98, max(image.r, max(image.g, image.b))));
+  }
+  colour = shown(radiance);
 }`;
 
 // few numbers from vertex to pixel: software renderers take as long for these as for the pixels
@@ -156,7 +162,7 @@ class Picture {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.environments = new Map();
-    this.albedos = scene.textures.map(() => this.texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)));
+    this.albedos = scene.images.map((image) => this.image(image, gl.REPEAT));
     this.smooth = null;
     this.geometry();
   }
@@ -209,27 +215,33 @@ class Picture {
     return texture;
   }
 
-  // A picture of an environment, made when it is seen first
+  // Textures of an environment, made when it is seen first: radiance, and a sharper image if it has one
   environment(light) {
     const { gl } = this;
     if (!this.environments.has(light)) {
-      const texture = this.texture(gl.RGB9_E5, light.width, light.height, gl.RGB, gl.UNSIGNED_INT_5_9_9_9_REV, light.words);
-      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-      this.environments.set(light, texture);
+      const radiance = this.texture(gl.RGB9_E5, light.width, light.height, gl.RGB, gl.UNSIGNED_INT_5_9_9_9_REV, light.words);
+      this.filter(radiance, gl.CLAMP_TO_EDGE);
+      this.environments.set(light, { radiance, image: light.image ? this.image(light.image, gl.CLAMP_TO_EDGE) : null });
     }
     return this.environments.get(light);
   }
 
-  // An albedo texture that was decoded
-  setAlbedo(number, image) {
+  filter(texture, wrap, smaller = this.gl.LINEAR) {
     const { gl } = this;
-    gl.bindTexture(gl.TEXTURE_2D, this.albedos[number]);
-    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, false);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, smaller);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, wrap);
+  }
+
+  // A texture of an image in sRGB that was decoded
+  image(image, wrap) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
     gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+    this.filter(texture, wrap, gl.LINEAR_MIPMAP_LINEAR);
+    return texture;
   }
 
   // Colours of vertices from coefficients of clusters (clusters, vectors + 1, 4)
@@ -269,7 +281,10 @@ class Picture {
     this.drawSurfaces(view, exposure, kind);
     const { program, uniforms } = this.programs.background;
     gl.useProgram(program);
-    this.bind(0, gl.TEXTURE_2D, this.environment(light), uniforms.environment);
+    const { radiance, image } = this.environment(light);
+    this.bind(0, gl.TEXTURE_2D, radiance, uniforms.environment);
+    this.bind(1, gl.TEXTURE_2D, image || radiance, uniforms.sharp);
+    gl.uniform1i(uniforms.sharper, image ? 1 : 0);
     gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
     gl.uniform1f(uniforms.degrees, degrees);
     gl.uniform1f(uniforms.exposure, exposure);
