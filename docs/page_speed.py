@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from selenium import webdriver
@@ -52,23 +54,29 @@ return result;
 OPEN = "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(viewer !== null); });"
 
 
+@contextmanager
+def opened(page: Path, *arguments: str) -> Iterator[webdriver.Chrome]:
+    """A browser that shows a page, whose viewer scripts find as ``v``."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(shutil.which("chromium"))
+    for argument in ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", *arguments):
+        options.add_argument(argument)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    try:
+        driver.get(page.resolve().as_uri())
+        if not driver.execute_async_script(OPEN):
+            raise SystemExit(driver.find_element("id", "sentence").text)
+        yield driver
+    finally:
+        driver.quit()
+
+
 def main() -> None:
     """Open the page and measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("page", type=Path, metavar="PAGE.html")
-    page = parser.parse_args().page.resolve()
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(shutil.which("chromium"))
-    for argument in ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader"):
-        options.add_argument(argument)
-    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
-    try:
-        driver.get(page.as_uri())
-        if not driver.execute_async_script(OPEN):
-            raise SystemExit(driver.find_element("id", "sentence").text)
+    with opened(parser.parse_args().page) as driver:
         print(json.dumps(driver.execute_script(MEASURE), indent=1))
-    finally:
-        driver.quit()
 
 
 if __name__ == "__main__":
