@@ -3,6 +3,9 @@
 import json
 import os
 import signal
+import subprocess
+import sys
+import urllib.request
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -249,6 +252,32 @@ def test_one_light_at_a_time(folder: Path, tmp_path: Path) -> None:
     assert abs(angles - 4 * np.pi) < 1e-4
     found = json.loads(report.read_text())["each"]
     assert found["pictures"] == 11 and found["bytes"] == sum(p.stat().st_size for p in into.iterdir())
+
+
+def test_a_page_is_exported(folder: Path, tmp_path: Path) -> None:
+    """With the lights that were given, of a matrix that is compressed on the way."""
+    page, report = tmp_path / "page.html", tmp_path / "r.json"
+    lights = ("-e", folder / "sky.exr", "-e", folder / "sun.exr")
+    done = call("view", folder / "m.prt", *lights, "--export", page, "--json", report, "--kept", 0.5)
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(report.read_text())
+    assert found["environments"] == ["sky", "sun"] and found["bytes"] == page.stat().st_size
+    assert page.read_text().startswith("<!doctype html>") and "<title>m</title>" in page.read_text()
+    done = call("view", folder / "m.prt", "--export", tmp_path / "none.html", "--kept", 2)
+    assert done.exit_code == 1 and "above 0 and up to 1" in done.stderr
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_a_page_is_shown_until_ctrl_c(folder: Path) -> None:
+    program = [sys.executable, "-m", "mi_sparse_prt", "view", folder / "m.prt", "--no-browser", "--quiet"]
+    with subprocess.Popen(map(str, program), stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        address = next(line.split()[0] for line in process.stderr if "127.0.0.1" in line)
+        with urllib.request.urlopen(address, timeout=20) as answer:
+            assert answer.status == 200 and b"<canvas" in answer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+        assert "interrupted" in process.stderr.read()
 
 
 @pytest.mark.parametrize(

@@ -451,7 +451,8 @@ def test_benchmark_choices(scene, tmp_path):
         ["relight", "x.prt", "-e", "x.exr"],
         ["relight", "x.prt", "-e", "x.exr", "-o", "x.jpg"],
         ["relight", "x.prt", "-e", "x.exr", "--vertices", "x.obj"],
-        ["view", "x.prt"],
+        ["look", "x.prt"],
+        ["view", "x.prt", "--export", "x.txt"],
         ["benchmark", "x.xml", "--figures", "folder"],
         ["benchmark", "x.xml", "--choices", "--method", "sparse"],
     ],
@@ -462,7 +463,9 @@ def test_usage_errors(arguments):
     assert "Usage" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["precompute", "relight", "validate", "info", "benchmark", "pictures"])
+@pytest.mark.parametrize(
+    "command", ["precompute", "relight", "view", "validate", "info", "benchmark", "pictures"]
+)
 def test_help_teaches(command):
     text = call(command, "--help").stdout
     assert f"Example: mi-sparse-prt {command}" in " ".join(text.split())

@@ -14,7 +14,8 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.clustered_pca import measure_cpca
 from mi_sparse_prt.benchmark.glossy_transport import GlossyEffort, diffuse_copy, measure_glossy
 from mi_sparse_prt.benchmark.moving_light import METHODS, MovingEffort, measure_moving_light
-from mi_sparse_prt.cli.tables.benchmark import cpca_tables, glossy_tables
+from mi_sparse_prt.benchmark.page_errors import measure_pages
+from mi_sparse_prt.cli.tables.benchmark import cpca_tables, glossy_tables, pages_tables
 from mi_sparse_prt.cli.tables.moving_light import moving_light_tables
 from mi_sparse_prt.scene.scene import Scene
 
@@ -93,6 +94,20 @@ def test_moving_light(tmp_path) -> None:
     assert names <= {path.stem for path in tmp_path.iterdir()}
     tables = printed(moving_light_tables(report))
     assert "a quarter of the weights" in tables and "with background" in tables and "FLIP" in tables
+
+
+def test_pages(tmp_path) -> None:
+    """What a page keeps more of, it is larger and more exact by."""
+    scene = tiny(diffuse(0.7, 0.7, 0.7))
+    report = measure_pages(scene, prt.CubemapLighting(8), False, tmp_path, rotations=4)
+    json.dumps(report)
+    pages = report["pages"]
+    assert np.all(np.diff([page["bytes"] for page in pages]) > 0)
+    means = [page["mean"] for page in pages]
+    assert means[0] > means[2] > means[-1] > 0 and means[-1] < 0.01
+    assert all(page["worst"] == max(page["errors"].values()) >= page["mean"] for page in pages)
+    assert (tmp_path / "pages.png").stat().st_size > 1000
+    assert "worst environment" in printed(pages_tables(report))
 
 
 def assert_pictures(found: dict) -> None:
