@@ -26,6 +26,7 @@ from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 FOLDER = "envmaps"  # beside a scene's file
+FALLBACK = {"sky", "sun"}  # where there is none
 PATHS_TOGETHER = 1 << 21
 SEED = (1 << 30) + 4
 

@@ -24,7 +24,7 @@ Environments = Annotated[
         "-e",
         metavar="ENV",
         help="Equirectangular HDR image to choose: .exr, .hdr or .pfm; may be repeated.",
-        show_default="those in the folder envmaps beside the scene; else a sky and a sun",
+        show_default="those in the folder envmaps beside the scene; else its own, a sky and a sun",
     ),
 ]
 Export = Annotated[
@@ -90,11 +90,17 @@ def view(
 
 
 def _lights(scene: Scene, files: list[Path] | None) -> dict[str, Environment]:
-    """Lights by name."""
+    """Lights by name: what is asked for, else those beside the scene, else its own, a sky and a sun."""
     from mi_sparse_prt import load_environment
-    from mi_sparse_prt.benchmark.relit_reference import environments_of
+    from mi_sparse_prt.benchmark.relit_reference import FALLBACK, environments_of
+    from mi_sparse_prt.emission.environment import environment_of
 
-    return {file.stem: load_environment(file) for file in files} if files else environments_of(scene)
+    if files:
+        return {file.stem: load_environment(file) for file in files}
+    found, emitter = environments_of(scene), scene.mitsuba.environment()
+    if found.keys() != FALLBACK or emitter is None:
+        return found
+    return {"scene": environment_of(emitter)} | found
 
 
 def _camera(scene: Scene, sensor: int) -> int | None:

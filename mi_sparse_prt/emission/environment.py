@@ -18,6 +18,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,6 +134,17 @@ def load_environment(path: str | os.PathLike[str]) -> Environment:
         reason = " ".join(str(error).split())
         raise PrtError(f"{path}: cannot be read as an image, export it again ({reason})") from error
     return Environment(_rgb_of(bitmap, path), source=str(path))
+
+
+def environment_of(emitter: mi.Emitter, height: int = 256) -> Environment:
+    """What an environment emitter of a scene shines, as an image of (height, 2 height) pixels: at their centres."""
+    theta, phi = (np.pi * (np.arange(n) + 0.5) / height for n in (height, 2 * height))
+    x, z = np.sin(theta)[:, None] * np.sin(phi), -np.sin(theta)[:, None] * np.cos(phi)
+    towards = np.stack(np.broadcast_arrays(x, np.cos(theta)[:, None], z)).reshape(3, -1)
+    si = dr.zeros(mi.SurfaceInteraction3f, towards.shape[1])
+    si.wi = -mi.Vector3f(np.ascontiguousarray(towards, np.float32))
+    radiance = np.array(emitter.eval(si))
+    return Environment(np.broadcast_to(radiance, (3, towards.shape[1])).T.reshape(height, 2 * height, 3))
 
 
 def _rgb_of(bitmap: mi.Bitmap, path: Path) -> NDArray[np.float32]:

@@ -8,9 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.ndimage
 from scipy.spatial.transform import Rotation
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.emission.environment import environment_of
 from mi_sparse_prt.emission.equirectangular import pixel_solid_angles
 
 ENVMAPS = Path(__file__).parents[2] / "scenes_xml" / "envmaps"
@@ -191,3 +193,17 @@ def test_degrees_mean_what_mitsuba_means(image):
 def test_other_matrices_are_refused(image, rotation, message):
     with pytest.raises(prt.PrtError, match=message):
         prt.Environment(image).rotated(rotation)
+
+
+def test_an_emitter_becomes_an_image():
+    """Of the light of a scene: projected, it is what the emitter itself is projected to."""
+    rng = np.random.default_rng(5)
+    smooth = scipy.ndimage.gaussian_filter(rng.random((32, 64, 3)), (3, 3, 0), mode="wrap").astype(np.float32)
+    turned = mi.ScalarTransform4f().rotate([0.2, 1, 0.1], 50)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(smooth), "to_world": turned})
+    lighting = prt.CubemapLighting(8)
+    expected = lighting.project(emitter)
+    found = lighting.project(environment_of(emitter))
+    assert np.abs(found - expected).max() < 2e-3 * expected.max()
+    constant = environment_of(mi.load_dict({"type": "constant", "radiance": 0.5}), 8)
+    assert constant.pixels.shape == (8, 16, 3) and np.allclose(constant.pixels, 0.5)

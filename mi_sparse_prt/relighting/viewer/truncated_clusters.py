@@ -56,10 +56,9 @@ class TruncatedClusters:
         of = np.repeat(np.arange(len(self.scales)), np.diff(self.starts))
         columns[self.order_of_wavelets[self.wavelets], of] = _expanded(self.values) * self.scales[of]
         weights = _expanded(self.weights)
-        squares = np.add.reduceat(np.square(weights).sum(axis=0), self.layout.starts[:-1], axis=1).T
-        return replace(
-            self.layout, columns=columns, weights=weights, sizes=np.sqrt(squares.astype(np.float64))
-        )
+        parts = np.split(weights.astype(np.float64), self.layout.starts[1:-1], axis=2)
+        sizes = np.sqrt([np.square(part).sum(axis=(0, 2)) for part in parts])
+        return replace(self.layout, columns=columns, weights=weights, sizes=sizes)
 
 
 def truncate_clusters(
@@ -70,7 +69,6 @@ def truncate_clusters(
     Parameters
     ----------
     clusters : ClusterColumns
-        Without empty clusters.
     kept : float
         The share of them that is kept, above 0 and up to 1.
     light : (m,) float
@@ -78,9 +76,9 @@ def truncate_clusters(
     order : (m,) integers
         All wavelets, the coarsest first: what is near in it is stored in less.
     """
-    channels, b, n = clusters.weights.shape
-    largest = np.maximum.reduceat(np.abs(clusters.weights).max(axis=0), clusters.starts[:-1], axis=1).T
-    largest = np.maximum(largest, 1e-30)  # (clusters, b)
+    channels = len(clusters.weights)
+    parts = np.split(np.abs(clusters.weights), clusters.starts[1:-1], axis=2)
+    largest = np.stack([part.max(axis=(0, 2), initial=1e-30) for part in parts])  # (clusters, b)
     scale = np.concatenate([np.ones((len(largest), 1)), largest], axis=1).ravel().astype(np.float32)
     members = np.diff(clusters.starts)
     weights: Floats = (clusters.weights / np.repeat(largest, members, axis=0).T).astype(np.float32)
