@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.read_only import read_only
 
-FLOATS = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)  # by their 16 bits
+with np.errstate(invalid="ignore"):  # some are no numbers, of the kind that signals
+    FLOATS = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)  # by their 16 bits
 FEW = 1 << 16  # numbers that NumPy has done before threads are awake
 
 

@@ -335,6 +335,20 @@ def test_a_lost_context_comes_back(page):
     assert np.abs(picture(page) - before).max() < 0.01
 
 
+def test_a_notebook_shows_the_page(page, exported, tmp_path):
+    """In a frame, as Jupyter puts it into a cell's output."""
+    notebook = tmp_path / "notebook.html"
+    notebook.write_text(f"<!doctype html><meta charset='utf-8'>{exported[2]._repr_html_()}")
+    page.get(notebook.as_uri())
+    page.switch_to.frame(page.find_element("tag name", "iframe"))
+    wait = "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(); });"
+    page.execute_async_script(wait)
+    page.execute_async_script(UNTIL, "v.exact", 5000)
+    page.execute_script("v.pinned = v.held = true; v.resize(...arguments);", *SIZE)
+    assert np.ptp(picture(page)) > 0.5
+    page.switch_to.default_content()
+
+
 def test_without_webgl_there_is_a_sentence(exported):
     opened = browser("--disable-3d-apis")
     try:

@@ -308,7 +308,8 @@ function run(viewer, canvas, show, pictures) {
       drawn = now;
       show();
       pictures();
-      if (!more) history.replaceState(null, "", "#" + viewer.address);
+      const hasAddress = location.protocol !== "about:"; // a frame of a notebook has none
+      if (!more && hasAddress) history.replaceState(null, "", "#" + viewer.address);
     }
     if (more) ask();
   };
