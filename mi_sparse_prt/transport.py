@@ -238,7 +238,7 @@ class LightTransport:
         self,
         lights: ArrayLike | Iterable[Any],
         into: Callable[[int, Floats], object] | Any = None,
-        together: int = 256,
+        together: int = 384,
     ) -> Floats | None:
         """Radiosity / pi under many lights, some at a time: a year of skies, or one light after the other.
 

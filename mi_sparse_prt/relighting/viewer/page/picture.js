@@ -58,10 +58,10 @@ out vec4 colour;
 void main() {
   vec3 d = normalize(towards * vec3(place, 1.0));
   vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307 + degrees / 360.0, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
-  vec3 radiance = textureLod(environment, uv, 0.0).rgb;
-  if (sharper == 1) { // but where it is too bright for an image of 8 bits
-    vec3 image = textureLod(sharp, uv, 0.0).rgb;
-    radiance = mix(image, max(radiance, image), step(0.98, max(image.r, max(image.g, image.b))));
+  vec3 radiance = sharper == 1 ? textureLod(sharp, uv, 0.0).rgb : vec3(1.0);
+  if (max(radiance.r, max(radiance.g, radiance.b)) > 0.98) { // too bright for an image of 8 bits, or there is none
+    vec3 blurred = textureLod(environment, uv, 0.0).rgb;
+    radiance = sharper == 1 ? max(radiance, blurred) : blurred;
   }
   colour = shown(radiance);
 }`;
@@ -221,7 +221,7 @@ class Picture {
     if (!this.environments.has(light)) {
       const radiance = this.texture(gl.RGB9_E5, light.width, light.height, gl.RGB, gl.UNSIGNED_INT_5_9_9_9_REV, light.words);
       this.filter(radiance, gl.CLAMP_TO_EDGE);
-      this.environments.set(light, { radiance, image: light.image ? this.image(light.image, gl.CLAMP_TO_EDGE) : null });
+      this.environments.set(light, { radiance, image: light.image ? this.image(light.image, gl.CLAMP_TO_EDGE, gl.LINEAR) : null });
     }
     return this.environments.get(light);
   }
@@ -235,12 +235,12 @@ class Picture {
   }
 
   // A texture of an image in sRGB that was decoded
-  image(image, wrap) {
+  image(image, wrap, smaller = this.gl.LINEAR_MIPMAP_LINEAR) {
     const { gl } = this, texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
-    gl.generateMipmap(gl.TEXTURE_2D);
-    this.filter(texture, wrap, gl.LINEAR_MIPMAP_LINEAR);
+    if (smaller !== gl.LINEAR) gl.generateMipmap(gl.TEXTURE_2D);
+    this.filter(texture, wrap, smaller);
     return texture;
   }
 
