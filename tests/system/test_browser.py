@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.ndimage
 from conftest import T, build, diffuse, still_life
 from numpy.testing import assert_allclose
 
@@ -14,6 +15,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import flip_map, relative_l2
 from mi_sparse_prt.emission.haar import haar_colours
 from mi_sparse_prt.relighting.approximations import (
+    Everything,
     Incremental,
     NonIncremental,
     PerBand,
@@ -22,6 +24,7 @@ from mi_sparse_prt.relighting.approximations import (
 )
 from mi_sparse_prt.relighting.players import ClusteredPlayer
 from mi_sparse_prt.relighting.viewer import make_page
+from mi_sparse_prt.relighting.viewer.page_scene import draw_order
 from mi_sparse_prt.validation.matrix_figures import panels
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: bash .ci/setup")
@@ -179,6 +182,43 @@ def test_a_picture_is_that_of_render(page, exported, artefact):
         artefact(side_by_side(linear(ours), theirs), name)
         assert away < FLIP, f"{name}: {away:.4f}"
         assert relative_l2(linear(ours), np.clip(theirs, 0, 1)) < 0.06
+
+
+def test_colours_of_vertices_are_those_of_python(page, exported):
+    """The graphics card's part: clusters to vertices. Expected: those of what the page keeps, to 0.1%."""
+    scene, _, made, _ = exported
+    player = ClusteredPlayer(made.clusters)
+    page.execute_script("v.set({environment: 1, degrees: 40}); v.relight('everything')")
+    light = array(page, "light").reshape(-1, 3)
+    player.apply(Everything(wavelet_bands(LIGHTING.resolution)).update(light, None))
+    found = np.array(page.execute_script(COLOURS), np.float32).reshape(-1, 4)[: scene.n_vertices, :3]
+    expected = np.maximum(player.incident, 0)[draw_order(scene).order]
+    assert relative_l2(found, expected) < 1e-3
+
+
+COLOURS = """
+const { gl, target, size } = v.picture, pixels = new Float32Array(4 * size[0] * size[1]);
+gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+gl.readPixels(0, 0, ...size, gl.RGBA, gl.FLOAT, pixels);
+gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+return Array.from(pixels);
+"""
+
+
+def test_surfaces_are_as_bright_as_those_of_render(page, exported):
+    """What is interpolated, reflected and shown: the mean of surfaces, edges and what is too bright left out.
+
+    Expected: within 0.7%, of which 8 bits and truncation are a part; 2% would not pass.
+    """
+    scene, transport, _, _ = exported
+    ours = linear(picture(page, "v.set({environment: 0, degrees: 250, exposure: -1})"))
+    theirs = prt.render(scene, transport, LIGHTS["first"].rotated(250), 0, 64) / 2
+    lit = prt.render(scene, transport, 1.0, 0, 64)
+    inside = np.abs(lit - 1).max(axis=-1) > 0.05  # the background is 1 there
+    inside = scipy.ndimage.binary_erosion(inside, iterations=3) & (theirs.max(axis=-1) < 1)
+    assert inside.mean() > 0.3
+    for channel in range(3):
+        assert ours[inside, channel].mean() == pytest.approx(theirs[inside, channel].mean(), rel=0.007)
 
 
 def test_turning_and_moving_change_the_picture(page):

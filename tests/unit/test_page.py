@@ -19,7 +19,7 @@ from mi_sparse_prt.emission.haar import haar_colours
 from mi_sparse_prt.relighting.clusters import cluster_columns
 from mi_sparse_prt.relighting.viewer.archive import KINDS, packed
 from mi_sparse_prt.relighting.viewer.export import _basis_arrays, expected_sizes, make_page
-from mi_sparse_prt.relighting.viewer.page_scene import HEIGHT, environment_words, strips
+from mi_sparse_prt.relighting.viewer.page_scene import HEIGHT, draw_order, environment_words
 from mi_sparse_prt.relighting.viewer.server import PageServer
 from mi_sparse_prt.relighting.viewer.truncated_clusters import truncate_clusters
 
@@ -104,7 +104,7 @@ def test_a_page_has_what_it_plays(coloured_scene, compressed):
     assert not re.search(r"(src|href)=|https?://", page.text.split('id="data"')[0])  # nothing from a network
     n = coloured_scene.n_vertices
     positions = found["positions"].reshape(-1, 3) / 65535 * found["extent"] + found["low"]
-    order = strips(coloured_scene).order
+    order = draw_order(coloured_scene).order
     assert_array_equal(np.sort(order), np.arange(n))
     assert_allclose(positions, coloured_scene.positions[order], atol=2e-5 * np.max(found["extent"]))
     assert_allclose(found["albedo"].reshape(-1, 3) / 65535, coloured_scene.albedo[order], atol=1e-5)
@@ -165,6 +165,15 @@ def test_expected_sizes_fall_from_coarse_to_fine():
     smooth = prt.Environment(np.broadcast_to(np.linspace(0, 1, 32)[:, None, None], (32, 64, 3)))
     sizes = expected_sizes({"smooth": smooth}, LIGHTING)
     assert np.all(np.diff(np.unique(sizes)) > 0) and sizes[0] == sizes.max() and sizes[-1] == sizes.min()
+
+
+def test_black_environments_have_pages(coloured_scene, compressed):
+    dark = prt.Environment(np.zeros((8, 16, 3), np.float32))
+    assert np.isfinite(expected_sizes({"dark": dark}, LIGHTING)).all()
+    mixed = expected_sizes({"dark": dark, "noise": ENVIRONMENT}, LIGHTING)
+    assert_allclose(mixed, expected_sizes({"noise": ENVIRONMENT}, LIGHTING))
+    page = make_page(coloured_scene, compressed, {"dark": dark}, kept=0.3)
+    assert np.isfinite(page.clusters.columns).all() and page.clusters.columns.any()
 
 
 def test_bad_input_is_told_in_a_line(coloured_scene, compressed):

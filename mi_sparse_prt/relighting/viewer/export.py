@@ -29,6 +29,7 @@ from mi_sparse_prt.transport import LightTransport
 
 KEPT = 0.05  # of the wavelet coefficients of all basis vectors, if not given
 TURNS = 8  # azimuths of each environment, whose wavelets say how large those of light are
+BLACK = 1e-30  # power of an environment that shines at all
 SCRIPTS = ("archive", "light", "wavelets", "radiance_file", "camera", "picture", "main")
 MOST = 1 << 16  # columns, and wavelets, that the page can number
 
@@ -125,18 +126,13 @@ def make_page(
         raise PrtError(
             f"{max(clusters.columns.shape)} wavelets or basis vectors are more than a page can number"
         )
-    bands, sides = haar_bands(lighting.resolution)
-    order = np.argsort(bands, kind="stable")
-    light = expected_sizes(environments, lighting)
-    truncated = truncate_clusters(clusters, kept, light, order)
-    decoded = truncated.decoded()
-    strips = page_scene.strips(scene)
-    arrays, about = page_scene.geometry(scene, strips)
-    arrays |= _basis_arrays(truncated) | _row_arrays(truncated, strips.order) | {"norms": decoded.norms()}
-    arrays |= {
-        f"environment{k}": page_scene.environment_words(light)
-        for k, light in enumerate(environments.values())
-    }
+    order = np.argsort(haar_bands(lighting.resolution)[0], kind="stable")
+    truncated = truncate_clusters(clusters, kept, expected_sizes(environments, lighting), order)
+    decoded, drawn = truncated.decoded(), page_scene.draw_order(scene)
+    geometry, about = page_scene.geometry(scene, drawn)
+    radiance, lights = page_scene.lights(environments)
+    arrays = geometry | radiance | _basis_arrays(truncated) | _row_arrays(truncated, drawn.order)
+    arrays["norms"] = decoded.norms()
     if sensor is None and scene.mitsuba.sensors():
         sensor = 0
     notes = _notes(scene)
@@ -147,15 +143,7 @@ def make_page(
         "channels": len(clusters.weights),
         "camera": page_scene.camera(scene, sensor),
         "exposure": 0,
-        "environments": [
-            {
-                "name": name,
-                "width": 2 * page_scene.HEIGHT,
-                "height": page_scene.HEIGHT,
-                "background": page_scene.background(environment),
-            }
-            for name, environment in environments.items()
-        ],
+        "environments": lights,
         "notes": notes,
     }
     data = packed(header, arrays, frozenset({"triangles", "starts", "order", "labels"}))
@@ -171,7 +159,9 @@ def expected_sizes(environments: Mapping[str, Environment], lighting: CubemapLig
             texels = lighting.project(environment.rotated(360 * k / TURNS))
             wavelets = haar_colours(texels, np.sqrt(lighting.solid_angles, dtype=np.float32))
             power = np.square(wavelets, dtype=np.float64).sum(axis=1)
-            squares += np.bincount(bands, power) / power.sum()
+            squares += np.bincount(bands, power) / max(power.sum(), BLACK)
+    if not squares.any():
+        return np.ones(len(bands), np.float32)  # all are black: each wavelet is as likely as the others
     return np.sqrt(squares / np.bincount(bands)).astype(np.float32)[bands]
 
 

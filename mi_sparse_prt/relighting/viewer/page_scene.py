@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Strips:
+class DrawOrder:
     """Triangles in an order in which each has vertices of those before it, and vertices in the order of their use.
 
     Graphics cards keep the last few vertices; and numbers that differ little from those before them are stored in less.
@@ -45,7 +46,7 @@ class Strips:
     order: NDArray[np.int64]
 
 
-def strips(scene: Scene) -> Strips:
+def draw_order(scene: Scene) -> DrawOrder:
     """Triangles along a space-filling curve."""
     parts = [_along_curve(scene, mesh.triangles + mesh.vertices.start) for mesh in scene.meshes]
     triangles = np.concatenate(parts)
@@ -53,7 +54,7 @@ def strips(scene: Scene) -> Strips:
     order = np.concatenate([used[np.argsort(first)], np.setdiff1d(np.arange(scene.n_vertices), used)])
     numbers = np.empty(len(order), np.int32)
     numbers[order] = np.arange(len(order), dtype=np.int32)
-    return Strips(numbers[triangles], order)
+    return DrawOrder(numbers[triangles], order)
 
 
 def _along_curve(scene: Scene, triangles: NDArray[np.integer]) -> NDArray[np.integer]:
@@ -61,7 +62,7 @@ def _along_curve(scene: Scene, triangles: NDArray[np.integer]) -> NDArray[np.int
     return triangles[morton_order(centres, np.arange(len(triangles), dtype=np.uint64))]
 
 
-def geometry(scene: Scene, own: Strips) -> tuple[Arrays, dict[str, Any]]:
+def geometry(scene: Scene, own: DrawOrder) -> tuple[Arrays, dict[str, Any]]:
     """Vertices and triangles of all sheets, and what to know of them."""
     low = scene.positions.min(axis=0)
     extent = np.maximum(np.ptp(scene.positions, axis=0), 1e-30)
@@ -135,6 +136,16 @@ def environment_words(environment: Environment, height: int = HEIGHT) -> NDArray
     exponent += np.rint(scaled.max(axis=-1) * 2.0 ** (24 - exponent)) > 511
     parts = np.rint(scaled * 2.0 ** (24 - exponent)[..., None]).astype(np.uint32)
     return parts[..., 0] | parts[..., 1] << 9 | parts[..., 2] << 18 | exponent.astype(np.uint32) << 27
+
+
+def lights(environments: Mapping[str, Environment]) -> tuple[Arrays, list[dict[str, Any]]]:
+    """Radiance of environments, and what to know of them."""
+    arrays = {f"environment{k}": environment_words(light) for k, light in enumerate(environments.values())}
+    about = [
+        {"name": name, "width": 2 * HEIGHT, "height": HEIGHT, "background": background(light)}
+        for name, light in environments.items()
+    ]
+    return arrays, about
 
 
 def background(environment: Environment) -> str:

@@ -270,8 +270,10 @@ class Picture {
   }
 
   // What the camera sees; smooth pictures have four samples in each pixel
-  draw({ camera, light, degrees, exposure, kind, smooth }) {
-    const { gl, canvas } = this, scale = smooth ? 2 : 1, width = scale * canvas.width, height = scale * canvas.height;
+  draw({ camera, light, degrees, exposure, kind, smooth: asked }) {
+    const { gl, canvas } = this, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE);
+    const smooth = asked && 2 * Math.max(canvas.width, canvas.height) <= most;
+    const scale = smooth ? 2 : 1, width = scale * canvas.width, height = scale * canvas.height;
     if (smooth) this.beginSmooth(width, height);
     gl.viewport(0, 0, width, height);
     gl.clear(gl.DEPTH_BUFFER_BIT);
