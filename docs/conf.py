@@ -9,6 +9,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]  # the checkout's own package, installed or not
 
 import mi_sparse_prt  # noqa: E402
+from mi_sparse_prt.relighting.viewer.export import page_text  # noqa: E402
 
 project = "mi-sparse-prt"
 author = "the authors of mi-sparse-prt"
@@ -38,6 +39,12 @@ sphinx_tabs_disable_tab_closing = True
 
 html_theme = "furo"
 html_title = "mi-sparse-prt"
+EXTRA = HERE.parent / "build" / "extra"  # pages of other kinds, copied as they are
+(EXTRA / "live").mkdir(parents=True, exist_ok=True)
+(EXTRA / "live" / "terrace.html").write_text(
+    page_text("terrace", (HERE / "live" / "terrace.txt").read_text())
+)
+html_extra_path = [str(EXTRA)]
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
 html_theme_options = {"navigation_with_keys": True, "top_of_page_buttons": []}

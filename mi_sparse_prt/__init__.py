@@ -23,6 +23,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.relighting.light import TurningLight
     from mi_sparse_prt.relighting.relighter import Relighter
     from mi_sparse_prt.relighting.viewer.export import Page, make_page
+    from mi_sparse_prt.relighting.viewer.widget import Viewer, show
     from mi_sparse_prt.scene.loading import load_scene
     from mi_sparse_prt.scene.scene import Scene
     from mi_sparse_prt.storage import load_transport
@@ -43,6 +44,7 @@ _MODULES = {
     "SceneEmitters": "emission.emitters",
     "TurningLight": "relighting.light",
     "Validation": "validation.validate",
+    "Viewer": "relighting.viewer.widget",
     "camera_pixels": "measurement.pixels",
     "compress": "compression.compress",
     "load_environment": "emission.environment",
@@ -53,6 +55,7 @@ _MODULES = {
     "precompute": "precompute",
     "precompute_glossy": "precompute",
     "render": "relighting.image",
+    "show": "relighting.viewer.widget",
     "validate": "validation.validate",
 }
 
@@ -70,6 +73,7 @@ __all__ = [
     "SceneEmitters",
     "TurningLight",
     "Validation",
+    "Viewer",
     "camera_pixels",
     "compress",
     "load_environment",
@@ -80,6 +84,7 @@ __all__ = [
     "precompute",
     "precompute_glossy",
     "render",
+    "show",
     "validate",
     "variant",
     "__version__",

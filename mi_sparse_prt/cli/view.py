@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import webbrowser
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from mi_sparse_prt.cli.tables.written import relighting_table
 
 if TYPE_CHECKING:
     from mi_sparse_prt import Environment, Scene
+    from mi_sparse_prt.relighting.viewer import LivePage
 
 Environments = Annotated[
     list[Path] | None,
@@ -63,7 +65,7 @@ def view(
     with running(json_file, quiet, outputs=[export]) as command:
         from mi_sparse_prt import compress, load_transport
         from mi_sparse_prt.core.profiling import Stopwatch
-        from mi_sparse_prt.relighting.viewer import make_page
+        from mi_sparse_prt.relighting.viewer import LivePage, make_live_page, make_page
 
         clock = Stopwatch()
         with command.prompt_interrupts():
@@ -71,22 +73,25 @@ def view(
                 loaded, transport = with_scene(
                     load_transport(matrix), matrix, scene, options.definitions(define)
                 )
-                lights = _lights(loaded, environment)
-            if "compressed" not in transport.operators:
+                lights = {} if transport.lights else _lights(loaded, environment)
+            diffuse = not transport.terms and not transport.lights
+            if diffuse and "compressed" not in transport.operators:
                 with clock.phase("compress"):
                     transport = compress(transport, progress=not quiet)
             with clock.phase("page"):
-                content = make_page(
+                make = make_live_page if export is None else make_page
+                made = make(
                     loaded, transport, lights, kept=kept, sensor=_camera(loaded, sensor), title=matrix.stem
                 )
-        page = content.text.encode()
-        command.report = {"matrix": str(matrix), "bytes": len(page), "notes": content.notes}
+        page = made.text.encode()
+        command.report = {"matrix": str(matrix), "bytes": len(page), "notes": made.notes}
         command.report |= {"environments": list(lights), "kept": kept, "seconds": clock.report()}
         if export is not None:
             command.write(export, page)
             command.show(relighting_table(f"{matrix} as a page", clock.seconds, {export: len(page)}))
             return
-        _serve(command, page, port, browser)
+        assert isinstance(made, LivePage)
+        _serve(command, made, port, browser)
 
 
 def _lights(scene: Scene, files: list[Path] | None) -> dict[str, Environment]:
@@ -108,11 +113,11 @@ def _camera(scene: Scene, sensor: int) -> int | None:
     return None if sensor == 0 and not scene.mitsuba.sensors() else sensor
 
 
-def _serve(command: Command, page: bytes, port: int, browser: bool) -> None:
-    """Show the page until Ctrl-C."""
+def _serve(command: Command, page: LivePage, port: int, browser: bool) -> None:
+    """Show the page, and answer it, until Ctrl-C."""
     from mi_sparse_prt.relighting.viewer.server import PageServer
 
-    with PageServer(page, port) as server:
+    with PageServer(page.text.encode(), port, page.answers.reply) as server, closing(page.answers):
         typer.echo(f"{server.url}  (Ctrl-C ends it)", err=True)
         command.hint = ": the page is closed"
         if browser:

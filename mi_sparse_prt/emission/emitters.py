@@ -73,6 +73,7 @@ class SceneEmitters:
         for j, own in enumerate(numbers):
             group_of[own] = j
         self._group_of = mi.Int32(group_of.astype(np.int32))
+        self._number_of = _numbers_of_pointers(self._scene)
 
     @property
     def size(self) -> int:
@@ -185,11 +186,8 @@ class SceneEmitters:
     ) -> tuple[mi.Int32, mi.Color3f]:
         """The element whose light rays meet, -1 for none, and its radiance along them."""
         emitter = si.emitter(self._scene, active)
-        numbers = dr.reinterpret_array(mi.UInt32, self._scene.emitters_dr()).numpy()
-        table = np.full(int(numbers.max()) + 1, -1)
-        table[numbers] = np.arange(len(numbers))
         known = active & (emitter != None)  # noqa: E711 - an array of pointers
-        number = dr.gather(mi.Int32, mi.Int32(table), dr.reinterpret_array(mi.UInt32, emitter), known)
+        number = dr.gather(mi.Int32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), known)
         known &= (number >= 0) & (number < len(self._group_of))
         group = dr.select(known, dr.gather(mi.Int32, self._group_of, mi.UInt32(number), known), -1)
         return group, dr.select(known, mi.Color3f(emitter.eval(si, known)), 0)
@@ -231,6 +229,17 @@ class StoredEmitters:
     project = SceneEmitters.project
     attributes = SceneEmitters.attributes
     __repr__ = SceneEmitters.__repr__
+
+
+def _numbers_of_pointers(scene: mi.Scene) -> mi.Int32:
+    """The place of each emitter in the scene's list, by Dr.Jit's own number of it; -1 for others.
+
+    Read before rays are traced: numbers do not come to the host in the body of a symbolic loop.
+    """
+    pointers = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy()
+    table = np.full(int(pointers.max()) + 1, -1, np.int32)
+    table[pointers] = np.arange(len(pointers))
+    return mi.Int32(table)
 
 
 def _dimmed(

@@ -80,6 +80,7 @@ class RelitScene:
         followed: Sequence[mi.BSDF] = (),
     ) -> None:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
+        self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
         self.goes_on = scene.specular or bool(followed)
         self._light = [_of_depths(irradiance)]  # irradiance / pi; coefficients of terms follow
@@ -138,7 +139,7 @@ class RelitScene:
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
-            value += radiance * dr.gather(mi.Color3f, mi.Color3f(brightness.T), mi.UInt32(lamp), lamp >= 0)
+            value += radiance * dr.gather(mi.Color3f, self._brightness, mi.UInt32(lamp), lamp >= 0)
         return Seen(value, si, whole)
 
     def _hit_corners(

@@ -1,15 +1,24 @@
 """Exported pages in a browser (headless Chromium, WebGL by its software renderer), against Python."""
 
-import base64
-import shutil
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.ndimage
 from conftest import T, build, diffuse, still_life
 from numpy.testing import assert_allclose
+from pages_in_browser import (
+    DROP,
+    MARKS,
+    SIZE,
+    UNTIL,
+    browser,
+    linear,
+    open_page,
+    picture,
+    radiance_file,
+    sky,
+    webdriver,
+)
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import flip_map, relative_l2
@@ -27,37 +36,10 @@ from mi_sparse_prt.relighting.viewer import make_page
 from mi_sparse_prt.relighting.viewer.page_scene import draw_order
 from mi_sparse_prt.validation.matrix_figures import panels
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: bash .ci/setup")
-BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(not (BROWSER and DRIVER), reason="no chromium or chromedriver: apt-get install both"),
-]
+pytestmark = MARKS
 
-SIZE = 320, 240
 LIGHTING = prt.CubemapLighting(16)
 FLIP = 0.05  # of a picture against Python's own
-
-
-def sky(seed: int, height: int = 64) -> prt.Environment:
-    """A gradient with a few soft lamps."""
-    rng = np.random.default_rng(seed)
-    theta = np.pi * (np.arange(height) + 0.5) / height
-    phi = np.pi * (np.arange(2 * height) + 0.5) / height
-    d = np.stack(
-        np.broadcast_arrays(
-            np.sin(theta)[:, None] * np.sin(phi),
-            np.cos(theta)[:, None],
-            -np.sin(theta)[:, None] * np.cos(phi),
-        ),
-        axis=-1,
-    )
-    pixels = np.full((*d.shape[:2], 3), 0.1) + 0.4 * np.maximum(d[..., 1:2], 0) * [0.5, 0.7, 1.0]
-    for _ in range(4):
-        towards = rng.normal(size=3) + [0, 0.8, 0]
-        lobe = np.exp(20 * (d @ (towards / np.linalg.norm(towards)) - 1))
-        pixels += lobe[..., None] * rng.uniform(0.5, 2, 3)
-    return prt.Environment(pixels.astype(np.float32))
 
 
 LIGHTS = {"first": sky(1), "second": sky(2)}
@@ -102,17 +84,6 @@ def exported(tmp_path_factory):
     return scene, transport, page, path
 
 
-def browser(*arguments: str):
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", *arguments):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-    driver.set_script_timeout(60)
-    return driver
-
-
 @pytest.fixture(scope="module")
 def driver():
     opened = browser()
@@ -123,32 +94,10 @@ def driver():
 @pytest.fixture
 def page(driver, exported):
     """The page, just opened, in pictures of a size."""
-    open_page(driver, exported[3])
+    open_page(driver, exported[3].as_uri())
     yield driver
     wrong = [entry["message"] for entry in driver.get_log("browser") if entry["level"] == "SEVERE"]
     assert wrong == []
-
-
-def open_page(driver, path: Path, address: str = "") -> None:
-    driver.get("about:blank")
-    driver.get(path.as_uri() + address)
-    assert driver.execute_async_script(
-        "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(viewer !== null); });"
-    )
-    driver.execute_script("v.pinned = v.held = true; v.resize(...arguments);", *SIZE)
-
-
-def picture(driver, script: str = "", *arguments) -> np.ndarray:
-    """Pixels (height, width, 3) in sRGB, 0 to 1, after a script."""
-    text = driver.execute_script(
-        script
-        + "; if (v.changed) v.relight('everything'); v.draw(true); return v.picture.canvas.toDataURL('image/png');",
-        *arguments,
-    )
-    stream = mi.MemoryStream()
-    stream.write(base64.b64decode(text.split(",")[1]))
-    stream.seek(0)
-    return np.array(mi.Bitmap(stream))[..., :3].astype(np.float32) / 255
 
 
 def array(driver, name: str) -> np.ndarray:
@@ -165,10 +114,6 @@ def side_by_side(ours: np.ndarray, theirs: np.ndarray):
         axis.imshow(np.clip(image, 0, 1) ** (1 / 2.2))
         axis.set(title=title)
     return figure
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def test_a_picture_is_that_of_render(page, exported, artefact):
@@ -300,13 +245,6 @@ def test_choices_and_sums_are_those_of_python(page, exported, method):
         assert relative_l2(total, (applied.T @ made.clusters.columns).T) < 1e-4
 
 
-UNTIL = """
-const [what, milliseconds, done] = arguments, test = new Function("return " + what), start = performance.now();
-const look = () => (test() || performance.now() - start > milliseconds ? done() : setTimeout(look, 20));
-look();
-"""
-
-
 def test_a_light_that_stands_still_is_exact(page):
     left_out = page.execute_script(
         "v.held = false; v.set({budget: 5, degrees: 10}); v.relight('everything');"
@@ -319,23 +257,6 @@ def test_a_light_that_stands_still_is_exact(page):
     kept = array(page, "clusters.total")
     page.execute_script(fresh + "; v.relight('everything')")
     assert relative_l2(kept, array(page, "clusters.total")) < 1e-6
-
-
-def radiance_file(pixels: np.ndarray) -> bytes:
-    """An .hdr file with rows that are not runs."""
-    mantissa, exponent = np.frexp(pixels.max(axis=-1))
-    scale = np.where(mantissa > 0, 256 * mantissa / np.maximum(pixels.max(axis=-1), 1e-30), 0)
-    rgbe = np.concatenate([pixels * scale[..., None], exponent[..., None] + 128], axis=-1).astype(np.uint8)
-    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {pixels.shape[0]} +X {pixels.shape[1]}\n"
-    return head.encode() + rgbe.tobytes()
-
-
-DROP = """
-const [name, bytes, done] = arguments, transfer = new DataTransfer();
-transfer.items.add(new File([new Uint8Array(bytes)], name));
-document.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer }));
-setTimeout(() => done(document.getElementById("sentence").textContent), 500);
-"""
 
 
 def test_a_dropped_image_is_used(page, exported, tmp_path):
@@ -360,7 +281,7 @@ def test_a_dropped_image_is_used(page, exported, tmp_path):
 def test_a_link_shows_the_same(page, exported):
     moved = picture(page, "v.set({environment: 1, degrees: 200, exposure: 0.5}); v.camera.orbit(0.4, 0.1)")
     address = page.execute_script("return '#' + v.address")
-    open_page(page, exported[3], address)
+    open_page(page, exported[3].as_uri() + address)
     assert np.abs(picture(page) - moved).mean() < 0.002  # five digits of the camera's place
 
 

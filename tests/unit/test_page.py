@@ -4,8 +4,10 @@ import base64
 import http.client
 import json
 import re
+import socket
 import struct
 import threading
+import time
 import zlib
 
 import numpy as np
@@ -17,6 +19,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.emission.haar import haar_colours
 from mi_sparse_prt.relighting.clusters import cluster_columns
+from mi_sparse_prt.relighting.viewer import server as server_module
 from mi_sparse_prt.relighting.viewer.archive import KINDS, packed
 from mi_sparse_prt.relighting.viewer.export import _basis_arrays, expected_sizes, make_page
 from mi_sparse_prt.relighting.viewer.page_scene import HEIGHT, draw_order, environment_words
@@ -101,7 +104,8 @@ def test_a_page_has_what_it_plays(coloured_scene, compressed):
     page = make_page(coloured_scene, compressed, {"noise": ENVIRONMENT}, kept=0.3, title="<still> life")
     found = in_page(page)
     assert "<title>&lt;still&gt; life</title>" in page.text
-    assert not re.search(r"(src|href)=|https?://", page.text.split('id="data"')[0])  # nothing from a network
+    head = page.text.split('id="data"')[0].replace('href="data:,"', "")  # no icon is asked for
+    assert not re.search(r"(src|href)=|https?://", head)  # nothing from a network
     n = coloured_scene.n_vertices
     positions = found["positions"].reshape(-1, 3) / 65535 * found["extent"] + found["low"]
     order = draw_order(coloured_scene).order
@@ -225,7 +229,83 @@ def test_the_page_is_for_those_who_know_its_address(server):
         {"Origin": "http://evil.example"},
     ):
         assert asked(server, **headers)[0] == 403
-    assert asked(server, method="POST")[0] == 501
+    assert asked(server, method="POST")[0] == 404
+    assert asked(server, method="PUT")[0] == 501
+
+
+@pytest.fixture
+def answering():
+    """A server whose answers are the questions, and that is told what was asked."""
+    heard = []
+
+    def answer(question, content):
+        heard.append((question, content))
+        return question | {"length": len(content)}, content[::-1]
+
+    with PageServer(b"<p>page</p>", 0, answer) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        yield serving, heard
+        serving.shutdown()
+
+
+def posted(server, body, path=None, **headers):
+    port = server.server_address[1]
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    path = server.url.split(str(port))[1] + "ask" if path is None else path
+    connection.request("POST", path, body, headers={"Host": f"127.0.0.1:{port}"} | headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def question(header: dict, content: bytes = b"") -> bytes:
+    words = json.dumps(header).encode()
+    return struct.pack("<I", len(words)) + words + content
+
+
+def test_questions_are_answered(answering):
+    server, heard = answering
+    status, found = posted(server, question({"ask": "row"}, b"abc"))
+    assert (status, found) == (200, question({"ask": "row", "length": 3}, b"cba"))
+    assert heard == [({"ask": "row"}, b"abc")]
+    for body in (b"", b"ab", struct.pack("<I", 99) + b"{}", struct.pack("<I", 2) + b"{]", question(3)):
+        status, found = posted(server, body)
+        assert status == 200 and b'"error": "this is no question of a page"' in found
+    assert len(heard) == 1
+
+
+def test_questions_are_for_those_who_know_the_address(answering):
+    server, heard = answering
+    port, asks = server.server_address[1], question({"ask": "row"})
+    for path in ("/", "/ask", "/token/ask", server.url.split(str(port))[1]):
+        assert posted(server, asks, path)[0] == 404
+    for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Origin": "null"}):
+        assert posted(server, asks, **headers)[0] == 403
+    for length in ("-1", "1e3", str(1 << 40)):
+        assert posted(server, asks, **{"Content-Length": length})[0] == 400
+    assert heard == []
+
+
+def test_one_that_stops_reading_holds_nobody_up(answering, monkeypatch):
+    """A browser that asks and never reads, and one that never sends what it said; others are answered meanwhile."""
+    server, heard = answering
+    monkeypatch.setattr(server_module._Answer, "timeout", 0.5)
+    port = server.server_address[1]
+    path = server.url.split(str(port))[1] + "ask"
+    head = f"POST {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: {{}}\r\n\r\n"
+    large = question({}, bytes(1 << 25))
+    silent = socket.create_connection(("127.0.0.1", port))
+    silent.sendall(head.format(1000).encode())
+    deaf = socket.create_connection(("127.0.0.1", port))
+    deaf.sendall(head.format(len(large)).encode() + large)
+    start = time.monotonic()
+    assert posted(server, question({"ask": "row"}))[0] == 200
+    assert time.monotonic() - start < 5
+    time.sleep(1.5)  # both are given up
+    waiting = [t for t in threading.enumerate() if "process_request_thread" in t.name]
+    silent.close()
+    deaf.close()
+    assert waiting == []
+    assert len(heard) == 2
 
 
 def test_a_port_that_is_taken(server):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -30,7 +31,8 @@ from mi_sparse_prt.transport import LightTransport
 KEPT = 0.05  # of the wavelet coefficients of all basis vectors, if not given
 TURNS = 8  # azimuths of each environment, whose wavelets say how large those of light are
 BLACK = 1e-30  # power of an environment that shines at all
-SCRIPTS = ("archive", "light", "wavelets", "radiance_file", "camera", "picture", "main")
+SCRIPTS = ("archive", "light", "wavelets", "radiance_file", "camera", "picture", "python", "main")
+DIFFERENCES = frozenset({"triangles", "starts", "order", "labels"})  # are kept as such
 MOST = 1 << 16  # columns, and wavelets, that the page can number
 
 Floats = NDArray[np.float32]
@@ -116,7 +118,17 @@ def make_page(
         If the matrix is another scene's or not of this kind, there is no light, or ``kept`` makes no sense.
     """
     transport = transport.for_scene(scene)
-    operator = _played(transport)
+    operator, drawn = _played(transport), page_scene.draw_order(scene)
+    played, arrays, header = played_part(operator, environments, kept, drawn.order)
+    shown, about = shown_part(scene, environments, sensor, drawn)
+    text = page_text(title, packed(about | header, shown | arrays, DIFFERENCES))
+    return Page(text, played, tuple(about["notes"]))
+
+
+def played_part(
+    operator: Clustered, environments: Mapping[str, Environment], kept: float, order: NDArray[np.int64]
+) -> tuple[ClusterColumns, page_scene.Arrays, dict[str, Any]]:
+    """What a page plays of clustered PCA, as ``make_page`` says: decoded, as arrays, and what to know of them."""
     if not environments:
         raise PrtError("a page without light shows nothing: give at least one environment")
     if not 0 < kept <= 1:
@@ -126,28 +138,41 @@ def make_page(
         raise PrtError(
             f"{max(clusters.columns.shape)} wavelets or basis vectors are more than a page can number"
         )
-    order = np.argsort(haar_bands(lighting.resolution)[0], kind="stable")
-    truncated = truncate_clusters(clusters, kept, expected_sizes(environments, lighting), order)
-    decoded, drawn = truncated.decoded(), page_scene.draw_order(scene)
-    geometry, about = page_scene.geometry(scene, drawn)
-    radiance, lights = page_scene.lights(environments)
-    arrays = geometry | radiance | _basis_arrays(truncated) | _row_arrays(truncated, drawn.order)
-    arrays["norms"] = decoded.norms()
-    if sensor is None and scene.mitsuba.sensors():
-        sensor = 0
-    notes = _notes(scene)
-    header = about | {
+    coarse_first = np.argsort(haar_bands(lighting.resolution)[0], kind="stable")
+    truncated = truncate_clusters(clusters, kept, expected_sizes(environments, lighting), coarse_first)
+    decoded = truncated.decoded()
+    arrays = _basis_arrays(truncated) | _row_arrays(truncated, order) | {"norms": decoded.norms()}
+    header = {
         "resolution": lighting.resolution,
         "clusters": len(clusters.starts) - 1,
         "vectors": clusters.sizes.shape[1],
         "channels": len(clusters.weights),
+    }
+    return decoded, arrays, header
+
+
+def shown_part(
+    scene: Scene,
+    environments: Mapping[str, Environment],
+    sensor: int | mi.Sensor | None,
+    drawn: page_scene.DrawOrder,
+    glossy: bool = False,
+) -> tuple[page_scene.Arrays, dict[str, Any]]:
+    """What a page shows whatever it plays: triangles, lights, a camera; as arrays, and what to know of them.
+
+    ``glossy`` says that it shows glossy terms, too.
+    """
+    geometry, about = page_scene.geometry(scene, drawn)
+    radiance, lights = page_scene.lights(environments)
+    if sensor is None and scene.mitsuba.sensors():
+        sensor = 0
+    about |= {
         "camera": page_scene.camera(scene, sensor),
         "exposure": 0,
         "environments": lights,
-        "notes": notes,
+        "notes": _notes(scene, glossy),
     }
-    data = packed(header, arrays, frozenset({"triangles", "starts", "order", "labels"}))
-    return Page(_text(title, data), decoded, notes)
+    return geometry | radiance, about
 
 
 def expected_sizes(environments: Mapping[str, Environment], lighting: CubemapLighting) -> Floats:
@@ -169,22 +194,22 @@ def _played(transport: LightTransport) -> Clustered:
     """The clusters of a matrix that a page can play."""
     if transport.measurement.kind != "vertices" or transport.emission.kind != CubemapLighting.kind:
         raise PrtError("a page shows matrices of vertices and a cubemap, no others")
+    if not isinstance(transport.reflection, Diffuse):
+        raise PrtError("a page without Python shows diffuse matrices: precompute this one without terms")
     operator = transport.operators.get("compressed")
     if not isinstance(operator, Clustered):
         raise PrtError("a page plays clustered PCA: compress the matrix first, prt.compress(transport)")
-    if not isinstance(transport.reflection, Diffuse):
-        raise PrtError("a page shows diffuse matrices: precompute this one without terms")
     return operator
 
 
-def _notes(scene: Scene) -> tuple[str, ...]:
+def _notes(scene: Scene, shows_glossy: bool) -> tuple[str, ...]:
     """What the page draws otherwise than ``render``."""
     names = [k.name for k in scene.materials[: len(scene.fronts)] if k.single_directions]
     glossy = [k.name for k in scene.materials[: len(scene.fronts)] if k.glossy and not k.single_directions]
     notes = []
     if names:
         notes.append(f"Mirrors, glass and masks are drawn plain: {', '.join(names)}.")
-    if glossy:
+    if glossy and not shows_glossy:
         notes.append(f"Glossy surfaces are drawn as diffuse ones: {', '.join(glossy)}.")
     return tuple(notes)
 
@@ -222,7 +247,8 @@ def _row_arrays(truncated: TruncatedClusters, order: NDArray[np.int64]) -> dict[
     }
 
 
-def _text(title: str, data: str) -> str:
+def page_text(title: str, data: str) -> str:
+    """HTML of a page around its archive."""
     folder = files(__package__) / "page"
     script = "\n".join((folder / f"{name}.js").read_text() for name in SCRIPTS)
     style = (folder / "style.css").read_text()

@@ -3,25 +3,29 @@
 const STILL = 150; // milliseconds after which nothing moves any more
 const PICTURES = 100; // between pictures of the light, while it moves
 const HEIGHT = 128; // pixels of an image that is dropped; larger ones become smaller
-const KINDS = { radiance: 0, light: 1, clusters: 2 };
+const KINDS = { radiance: 0, light: 1, clusters: 2, error: 3 };
+const CLICK = 3; // pixels that a click may move
 
 class Viewer {
   constructor(scene, picture) {
     Object.assign(this, { scene, picture, camera: new Camera(scene.camera, Math.hypot(...scene.extent)) });
     const { arrays } = scene;
     this.cubemap = new Cubemap(scene.resolution);
-    this.clusters = new Clusters(this.cubemap, {
-      starts: arrays.starts, gaps: arrays.gaps, values: arrays.values, scales: arrays.scales, order: arrays.order,
-    });
-    this.approximation = new Approximation(this.cubemap, arrays.norms);
+    if (scene.streamed) this.streamed = new Streamed(this);
+    else
+      this.clusters = new Clusters(this.cubemap, {
+        starts: arrays.starts, gaps: arrays.gaps, values: arrays.values, scales: arrays.scales, order: arrays.order,
+      });
+    this.approximation = new Approximation(this.cubemap, arrays.norms || new Float32Array(this.cubemap.size).fill(1));
     this.environments = scene.environments.map(({ name, width, height, image }, k) => {
       const words = arrays[`environment${k}`];
-      return Object.assign(new Environment(name, width, height, decodeShared(words)), { words, image });
+      return Object.assign(new Environment(name, width, height, decodeShared(words)), { words, image, number: k });
     });
     this.texels = new Float32Array(3 * this.cubemap.size);
     this.light = new Float32Array(3 * this.cubemap.size);
     this.state = {
       environment: 0, degrees: 0, exposure: scene.exposure, method: "per_band", budget: 100, colours: "radiance",
+      beside: "", line: 0.5, lamps: (scene.lamps || []).map(() => 1),
     };
     this.milliseconds = {};
     this.changed = true;
@@ -33,12 +37,25 @@ class Viewer {
     return this.environments[this.state.environment];
   }
 
+  // How bright lamps are, (lamps, 3)
+  get brightness() {
+    return Float32Array.from(this.state.lamps.flatMap((value) => [value, value, value]));
+  }
+
+  // From now on Python answers
+  connect(ask) {
+    this.python = new Python(ask);
+    this.changed = true;
+    this.touch();
+  }
+
   // Change what is seen; names are those of state
   set(changes) {
     const before = { ...this.state };
     Object.assign(this.state, changes);
     this.state.degrees = ((this.state.degrees % 360) + 360) % 360;
     if (before.environment !== this.state.environment || before.degrees !== this.state.degrees) this.changed = true;
+    if (changes.lamps) this.changed = true;
     this.touch();
   }
 
@@ -49,15 +66,17 @@ class Viewer {
 
   // L of a frame, what of it is applied, and colours of vertices; the first frame is exact, and so is one that stands still
   relight(method = this.started ? this.state.method : "everything") {
+    if (this.state.lamps.length) return this.relightLamps();
     const times = [performance.now()], lap = () => times.push(performance.now());
     this.environment.project(this.cubemap, this.state.degrees, this.texels);
     this.cubemap.haar(this.texels, this.light);
     lap();
     const chosen = this.approximation.update(this.light, method, this.state.budget);
     lap();
-    this.clusters.apply(this.approximation, this.light, chosen);
+    (this.clusters || this.streamed).apply(this.approximation, this.light, chosen);
     lap();
-    this.picture.relight(this.clusters.total);
+    if (this.streamed) this.streamed.send();
+    else this.picture.relight(this.clusters.total);
     lap();
     ["light", "choice", "sums", "upload"].forEach((name, k) => (this.milliseconds[name] = times[k + 1] - times[k]));
     this.chosen = chosen.length;
@@ -66,11 +85,17 @@ class Viewer {
     this.exact = method === "everything";
   }
 
+  relightLamps() {
+    Object.assign(this, { chosen: this.state.lamps.length, started: true, changed: false, exact: true });
+    this.streamed.light = this.brightness;
+    this.streamed.send();
+  }
+
   draw(smooth = false) {
     const start = performance.now(), { state } = this;
     this.picture.draw({
       camera: this.camera, light: this.environment, degrees: state.degrees, exposure: 2 ** state.exposure,
-      kind: KINDS[state.colours], smooth,
+      kind: KINDS[state.colours], smooth, brightness: state.lamps[this.scene.backgroundLamp] ?? 1,
     });
     this.milliseconds.draw = performance.now() - start;
   }
@@ -85,15 +110,39 @@ class Viewer {
     const moving = now - this.moved < STILL;
     if (this.changed) this.relight();
     else if (!moving && !this.exact) this.relight("everything");
+    else if (this.streamed && this.streamed.old) this.streamed.send();
     this.draw(!moving);
     return moving;
   }
 
   drop(name, image) {
     const { width, height, values } = shrunk(image, HEIGHT);
-    const environment = Object.assign(new Environment(name, width, height, values), { words: encodeShared(values) });
+    this.addLight(Object.assign(new Environment(name, width, height, values), { words: encodeShared(values) }));
+  }
+
+  addLight(environment) {
     this.environments.push(environment);
     this.set({ environment: this.environments.length - 1 });
+  }
+
+  // A PNG of what is seen
+  screenshot() {
+    this.draw(true);
+    return new Promise((done) => this.picture.canvas.toBlob(done));
+  }
+
+  // What is shown, as others may set it: light by its name, camera as six numbers
+  get shown() {
+    const { environment, degrees, exposure, lamps } = this.state, { eye, target } = this.camera;
+    return { light: this.environments[environment].name, degrees, exposure, camera: [...eye, ...target], lamps };
+  }
+
+  apply({ light, degrees, exposure, camera, lamps }) {
+    const environment = this.environments.findIndex(({ name }) => name === light);
+    const changes = environment < 0 ? { degrees, exposure } : { environment, degrees, exposure };
+    if (String(lamps) !== String(this.state.lamps) && lamps.length === this.state.lamps.length) changes.lamps = [...lamps];
+    if (camera.length === 6) [this.camera.eye, this.camera.target] = [camera.slice(0, 3), camera.slice(3)];
+    this.set(changes);
   }
 
   get address() {
@@ -139,18 +188,25 @@ function panel(viewer) {
   const show = () => {
     const { state } = viewer;
     if (elements.environment.length !== viewer.environments.length) list();
-    for (const name of ["environment", "degrees", "exposure", "method", "colours"]) elements[name].value = state[name];
+    for (const name of ["environment", "degrees", "exposure", "method", "colours", "beside", "line"]) elements[name].value = state[name];
+    state.lamps.forEach((value, k) => (elements[`lamp${k}`].value = value));
     elements.budget.value = Math.log2(state.budget);
     elements.play.textContent = viewer.playing ? "stop" : "turn";
   };
   form.addEventListener("input", ({ target }) => {
+    if (target.name.startsWith("lamp")) {
+      const lamps = viewer.state.lamps.map((_, k) => +elements[`lamp${k}`].value);
+      return viewer.set({ lamps });
+    }
     const value = target.name === "budget" ? Math.round(2 ** target.value) : target.value;
-    viewer.set({ [target.name]: ["method", "colours"].includes(target.name) ? value : +value });
+    viewer.set({ [target.name]: ["method", "colours", "beside"].includes(target.name) ? value : +value });
   });
+  forThisMatrix(viewer, form);
   const numbers = document.getElementById("numbers");
   const pictures = () => {
     if (form.hidden) return;
     const { milliseconds, approximation, cubemap, state } = viewer, exposure = 2 ** state.exposure;
+    if (state.lamps.length) return (numbers.textContent = `${(milliseconds.sums || 0).toFixed(0)} ms for colours`);
     cubemap.inverse(approximation.applied, applied);
     unfold(document.getElementById("light"), viewer.texels, cubemap.n, exposure);
     unfold(document.getElementById("applied"), applied, cubemap.n, exposure);
@@ -164,16 +220,43 @@ function panel(viewer) {
   return { form, show, pictures };
 }
 
+// What the panel leaves out, and a slider for each lamp
+function forThisMatrix(viewer, form) {
+  const { scene } = viewer, { elements } = form, hide = (element) => (element.hidden = true);
+  document.getElementById("asked").hidden = !scene.live;
+  if (scene.streamed) hide(elements.colours.querySelector('[value="clusters"]'));
+  const errors = Object.entries(scene.errors || {});
+  if (!errors.length) hide(elements.colours.querySelector('[value="error"]'));
+  elements.colours.title = errors.map(([name, { error }]) => `${name}: ${(100 * error).toFixed(1)}%`).join("\n");
+  if (!scene.lamps || !scene.lamps.length) return;
+  for (const name of ["environment", "degrees", "method", "budget"]) hide(elements[name].parentElement);
+  form.querySelectorAll(".pictures").forEach(hide);
+  hide(elements.play);
+  hide(document.getElementById("vertex"));
+  const slider = (name, k) => {
+    const input = Object.assign(document.createElement("input"), { type: "range", name: `lamp${k}`, min: 0, max: 2, step: 0.01, value: 1 });
+    const label = Object.assign(document.createElement("label"), { title: name });
+    label.append(Object.assign(document.createElement("span"), { textContent: name }), input);
+    return label;
+  };
+  document.getElementById("lamps").replaceChildren(...scene.lamps.map(slider));
+}
+
 function pointers(viewer, canvas) {
   const held = new Map();
-  let spread = 0;
+  let spread = 0, pressed = [0, 0];
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, event);
     spread = 0;
+    pressed = [event.clientX, event.clientY];
   });
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => held.delete(event.pointerId));
+  canvas.addEventListener("click", ({ clientX, clientY }) => {
+    if (!viewer.python || viewer.state.lamps.length || Math.hypot(clientX - pressed[0], clientY - pressed[1]) > CLICK) return;
+    askRow(viewer, (2 * clientX) / canvas.clientWidth - 1, 1 - (2 * clientY) / canvas.clientHeight);
+  });
   canvas.addEventListener("pointermove", (event) => {
     const before = held.get(event.pointerId);
     if (!before) return;
@@ -213,6 +296,7 @@ function dropped(viewer) {
 }
 
 async function openLight(viewer, file) {
+  if (viewer.python) return askLight(viewer, file);
   try {
     if (!/\.hdr$/i.test(file.name)) throw new Error("only .hdr images are read here");
     viewer.drop(file.name, readRadiance(new Uint8Array(await file.arrayBuffer())));
@@ -222,20 +306,18 @@ async function openLight(viewer, file) {
   }
 }
 
-function screenshot(viewer) {
-  viewer.draw(true);
-  viewer.picture.canvas.toBlob((blob) => {
-    const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: "picture.png" });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-  });
+async function saveScreenshot(viewer) {
+  const link = document.createElement("a");
+  Object.assign(link, { href: URL.createObjectURL(await viewer.screenshot()), download: "picture.png" });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
 function actions(viewer, form) {
   const keys = document.getElementById("keys");
   const all = {
     play: () => (viewer.playing = !viewer.playing),
-    screenshot: () => screenshot(viewer),
+    screenshot: () => saveScreenshot(viewer),
     home: () => viewer.camera.home(),
     help: () => (keys.open ? keys.close() : keys.showModal()),
     panel: () => (form.hidden = !form.hidden),
@@ -275,11 +357,14 @@ async function openPage() {
   pointers(viewer, canvas);
   dropped(viewer);
   actions(viewer, form);
+  viewer.beside = new Beside(viewer, document.getElementById("beside"));
   run(viewer, canvas, show, pictures);
+  if (scene.live && location.protocol.startsWith("http")) viewer.connect(askServer);
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
     viewer.picture.prepare();
-    viewer.picture.relight(viewer.clusters.total);
+    if (viewer.clusters) viewer.picture.relight(viewer.clusters.total);
+    else if (viewer.received) viewer.picture.receive(viewer.received);
     viewer.touch();
   });
   return viewer;
@@ -308,6 +393,8 @@ function run(viewer, canvas, show, pictures) {
       drawn = now;
       show();
       pictures();
+      viewer.beside.follow(more);
+      if (!more && viewer.onstill) viewer.onstill();
       const hasAddress = location.protocol !== "about:"; // a frame of a notebook has none
       if (!more && hasAddress) history.replaceState(null, "", "#" + viewer.address);
     }

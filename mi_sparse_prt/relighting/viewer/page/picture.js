@@ -69,6 +69,10 @@ void main() {
 // few numbers from vertex to pixel: software renderers take as long for these as for the pixels
 const SURFACE = `
 uniform sampler2D light;
+#ifdef SHINES
+uniform sampler2D shine;
+out vec3 gloss;
+#endif
 uniform mat4 projected;
 uniform vec3 low, extent, eye;
 uniform int kind;
@@ -85,7 +89,11 @@ out vec2 texcoords;
 void main() {
   vec3 where = low + extent * position;
   seen = dot(normal, eye - where);
-  radiance = kind == 2 ? cluster : texelFetch(light, ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW}), 0).rgb;
+  ivec2 own = ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW});
+  radiance = kind == 2 ? cluster : texelFetch(light, own, 0).rgb;
+#ifdef SHINES
+  gloss = kind == 0 ? texelFetch(shine, own, 0).rgb : vec3(0.0);
+#endif
 #ifdef TEXTURED
   texcoords = uv;
 #else
@@ -99,6 +107,9 @@ uniform int back;
 in float seen;
 in vec3 radiance;
 out vec4 colour;
+#ifdef SHINES
+in vec3 gloss;
+#endif
 #ifdef TEXTURED
 uniform sampler2D albedos;
 in vec2 texcoords;
@@ -109,6 +120,9 @@ void main() {
   vec3 leaving = radiance * texture(albedos, texcoords).rgb;
 #else
   vec3 leaving = radiance;
+#endif
+#ifdef SHINES
+  leaving += gloss;
 #endif
   colour = seen > 0.0 ? shown(leaving) : vec4(0.0, 0.0, 0.0, 1.0); // one-sided surfaces are black from behind
 }`;
@@ -132,17 +146,35 @@ class Picture {
 
   // All that lives on the graphics card; again after it was lost
   prepare() {
-    const { gl, scene } = this, { arrays } = scene;
+    const { gl, scene } = this;
     if (!gl.getExtension("EXT_color_buffer_float"))
       throw new Error("This page needs float textures (EXT_color_buffer_float), which this graphics card does not have.");
+    const head = HEAD + (scene.shines ? "#define SHINES\n" : ""), textured = head + "#define TEXTURED\n";
     this.programs = {
-      colours: this.program(FILL, `${HEAD}#define QUADS ${Math.ceil(scene.vectors / 4)}\n#define CHANNELS ${scene.channels}\n${COLOURS}`),
       background: this.program(FILL, BACKGROUND),
-      plain: this.program(HEAD + SURFACE, HEAD + SHADING),
-      textured: this.program(`${HEAD}#define TEXTURED\n${SURFACE}`, `${HEAD}#define TEXTURED\n${SHADING}`),
+      plain: this.program(head + SURFACE, head + SHADING),
+      textured: this.program(textured + SURFACE, textured + SHADING),
     };
-    const rows = Math.ceil(scene.vertices / ROW), quads = Math.ceil(scene.vectors / 4);
-    this.size = [ROW, rows];
+    this.size = [ROW, Math.ceil(scene.vertices / ROW)];
+    if (scene.streamed) this.prepareStreamed();
+    else this.prepareClusters();
+    this.environments = new Map();
+    this.albedos = scene.images.map((image) => this.image(image, gl.REPEAT));
+    this.smooth = null;
+    this.geometry();
+  }
+
+  // Colours of vertices, and what glossy terms add or lamps shine, as Python sends them
+  prepareStreamed() {
+    const { gl, scene } = this, none = () => this.texture(gl.RGB16F, ...this.size, gl.RGB, gl.HALF_FLOAT, null);
+    this.light = none();
+    this.shine = scene.shines ? none() : null;
+  }
+
+  prepareClusters() {
+    const { gl, scene } = this, { arrays } = scene, rows = this.size[1], quads = Math.ceil(scene.vectors / 4);
+    const head = `${HEAD}#define QUADS ${quads}\n#define CHANNELS ${scene.channels}\n`;
+    this.programs.colours = this.program(FILL, head + COLOURS);
     this.labels = this.texture(gl.R16UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_SHORT, padded(arrays.labels, ROW * rows));
     this.weights = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.weights);
@@ -161,10 +193,17 @@ class Picture {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    this.environments = new Map();
-    this.albedos = scene.images.map((image) => this.image(image, gl.REPEAT));
-    this.smooth = null;
-    this.geometry();
+  }
+
+  // Colours (vertices, 3) in half floats, one array after the other
+  receive(halves) {
+    const { gl, scene } = this, count = 3 * scene.vertices;
+    [this.light, this.shine].forEach((texture, k) => {
+      if (!texture) return;
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      const own = padded(halves.subarray(k * count, (k + 1) * count), 3 * ROW * this.size[1]);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...this.size, gl.RGB, gl.HALF_FLOAT, own);
+    });
   }
 
   geometry() {
@@ -270,7 +309,7 @@ class Picture {
   }
 
   // What the camera sees; smooth pictures have four samples in each pixel
-  draw({ camera, light, degrees, exposure, kind, smooth: asked }) {
+  draw({ camera, light, degrees, exposure, brightness, kind, smooth: asked }) {
     const { gl, canvas } = this, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE);
     const smooth = asked && 2 * Math.max(canvas.width, canvas.height) <= most;
     const scale = smooth ? 2 : 1, width = scale * canvas.width, height = scale * canvas.height;
@@ -289,7 +328,7 @@ class Picture {
     gl.uniform1i(uniforms.sharper, image ? 1 : 0);
     gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
     gl.uniform1f(uniforms.degrees, degrees);
-    gl.uniform1f(uniforms.exposure, exposure);
+    gl.uniform1f(uniforms.exposure, exposure * brightness);
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     if (smooth) this.endSmooth(width, height);
@@ -309,14 +348,16 @@ class Picture {
       gl.uniform3fv(uniforms.extent, scene.extent);
       gl.uniform3fv(uniforms.eye, view.eye);
       gl.uniform1f(uniforms.exposure, exposure);
-      gl.uniform1i(uniforms.kind, kind);
+      gl.uniform1i(uniforms.kind, Math.min(kind, 2));
+      if (scene.shines) this.bind(2, gl.TEXTURE_2D, this.shine, uniforms.shine);
       for (const mesh of scene.meshes)
-        if ((mesh.texture !== null && kind === 0) === (name === "textured")) this.drawMesh(mesh, uniforms);
+        if ((mesh.texture !== null && kind === 0) === (name === "textured")) this.drawMesh(mesh, uniforms, kind);
     }
   }
 
-  drawMesh(mesh, uniforms) {
-    const { gl } = this;
+  drawMesh(mesh, uniforms, kind) {
+    const { gl, scene } = this;
+    if (kind === 3) gl.vertexAttrib3fv(CLUSTER, scene.errors[mesh.name] ? scene.errors[mesh.name].colour : [0.2, 0.2, 0.2]);
     if (uniforms.albedos) this.bind(1, gl.TEXTURE_2D, this.albedos[mesh.texture], uniforms.albedos);
     gl.uniform1i(uniforms.back, mesh.back ? 1 : 0);
     if (mesh.back) gl.enable(gl.POLYGON_OFFSET_FILL); // it lies where its front lies

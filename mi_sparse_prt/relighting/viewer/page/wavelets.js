@@ -43,6 +43,11 @@ class Approximation {
     for (let j = 0; j < size; j++) if (resets[band[j]]) sizes[j] = own[j];
   }
 
+  // Let chosen wavelets be those of the light
+  apply(light, chosen) {
+    for (const j of chosen) for (let c = 0; c < 3; c++) this.applied[3 * j + c] = light[3 * j + c];
+  }
+
   // How far what is applied is from the light, relative, by area ([OBRG06] Figure 7)
   error(light) {
     const { applied, cubemap } = this;
@@ -96,13 +101,12 @@ class Clusters {
   }
 
   // Let chosen wavelets of what is applied be those of the light
-  apply({ applied, resets }, light, chosen) {
-    const { cubemap, starts, places, values, sums, total } = this;
+  apply(approximation, light, chosen) {
+    const { cubemap, starts, places, values, sums, total } = this, { applied, resets } = approximation;
     for (let band = 0; band < cubemap.bands; band++) if (resets[band]) sums[band].fill(0);
     for (const j of chosen) {
       const sum = sums[cubemap.band[j]];
       const r = light[3 * j] - applied[3 * j], g = light[3 * j + 1] - applied[3 * j + 1], b = light[3 * j + 2] - applied[3 * j + 2];
-      for (let c = 0; c < 3; c++) applied[3 * j + c] = light[3 * j + c];
       for (let k = starts[j]; k < starts[j + 1]; k++) {
         const place = 3 * places[k], value = values[k];
         sum[place] += r * value;
@@ -110,6 +114,7 @@ class Clusters {
         sum[place + 2] += b * value;
       }
     }
+    approximation.apply(light, chosen);
     for (let k = 0; k < this.columns; k++)
       for (let c = 0; c < 3; c++) {
         let value = 0;
