@@ -285,6 +285,24 @@ def test_a_link_shows_the_same(page, exported):
     assert np.abs(picture(page) - moved).mean() < 0.002  # five digits of the camera's place
 
 
+def test_a_film_is_recorded(page):
+    """While the light turns. Expected: WebM by its first bytes, and frames in it."""
+    head = page.execute_async_script(
+        """
+        const done = arguments[0];
+        v.held = false;
+        const bytes = async (film) => [...new Uint8Array(await film.arrayBuffer())];
+        v.recorder.ended = async (film) => done([film.type, film.size, (await bytes(film)).slice(0, 4)]);
+        v.recorder.toggle();
+        v.playing = true;
+        v.touch();
+        setTimeout(() => { v.playing = false; v.recorder.toggle(); }, 1500);
+        """
+    )
+    assert head[0].startswith("video/webm") and head[1] > 5000 and head[2] == [0x1A, 0x45, 0xDF, 0xA3]
+    assert page.execute_script("return v.recorder.recording") is None
+
+
 def test_a_lost_context_comes_back(page):
     before = picture(page)
     page.execute_script(

@@ -191,6 +191,7 @@ function panel(viewer) {
     for (const name of ["environment", "degrees", "exposure", "method", "colours", "beside", "line"]) elements[name].value = state[name];
     state.lamps.forEach((value, k) => (elements[`lamp${k}`].value = value));
     elements.budget.value = Math.log2(state.budget);
+    elements.record.textContent = viewer.recorder.recording ? "stop film" : "film";
     elements.play.textContent = viewer.playing ? "stop" : "turn";
   };
   form.addEventListener("input", ({ target }) => {
@@ -306,18 +307,38 @@ async function openLight(viewer, file) {
   }
 }
 
-async function saveScreenshot(viewer) {
-  const link = document.createElement("a");
-  Object.assign(link, { href: URL.createObjectURL(await viewer.screenshot()), download: "picture.png" });
+function save(blob, name) {
+  const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+// A film of what is seen, from one call to the next
+class Recorder {
+  constructor(viewer, ended = (film) => save(film, "film.webm")) {
+    Object.assign(this, { viewer, ended, recording: null });
+  }
+
+  toggle() {
+    if (this.recording) {
+      this.recording.stop();
+      this.recording = null;
+      return;
+    }
+    const parts = [], recording = new MediaRecorder(this.viewer.picture.canvas.captureStream(), { videoBitsPerSecond: 8e6 });
+    recording.addEventListener("dataavailable", ({ data }) => parts.push(data));
+    recording.addEventListener("stop", () => this.ended(new Blob(parts, { type: recording.mimeType })));
+    recording.start();
+    this.recording = recording;
+  }
 }
 
 function actions(viewer, form) {
   const keys = document.getElementById("keys");
   const all = {
     play: () => (viewer.playing = !viewer.playing),
-    screenshot: () => saveScreenshot(viewer),
+    screenshot: async () => save(await viewer.screenshot(), "picture.png"),
+    record: () => viewer.recorder.toggle(),
     home: () => viewer.camera.home(),
     help: () => (keys.open ? keys.close() : keys.showModal()),
     panel: () => (form.hidden = !form.hidden),
@@ -328,7 +349,7 @@ function actions(viewer, form) {
     darker: () => viewer.set({ exposure: viewer.state.exposure - 0.25 }),
   };
   const byKey = {
-    " ": "play", s: "screenshot", h: "home", "?": "help", p: "panel", n: "next", ArrowLeft: "left", ArrowRight: "right",
+    " ": "play", s: "screenshot", r: "record", h: "home", "?": "help", p: "panel", n: "next", ArrowLeft: "left", ArrowRight: "right",
     "+": "brighter", "=": "brighter", "-": "darker",
   };
   const act = (name) => {
@@ -352,6 +373,7 @@ async function openPage() {
   const viewer = new Viewer(scene, new Picture(canvas, scene));
   document.getElementById("notes").textContent = scene.notes.join(" ");
   viewer.address = location.hash.slice(1);
+  viewer.recorder = new Recorder(viewer);
   const { form, show, pictures } = panel(viewer);
   form.hidden = false;
   pointers(viewer, canvas);
