@@ -41,14 +41,14 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     sensor = scene.sensor(sensor)
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
-    places = _jittered(width, height, spp, seed)
+    places = jittered_places(width, height, spp, seed)
     si, reflects = _seen(scene.mitsuba, sensor, places, (width, height))
     kept = np.flatnonzero(reflects)
     if not len(kept):
         raise PrtError("the camera sees no surface that reflects; move it, or choose another sensor")
     here = mi.UInt32(kept.astype(np.uint32))
     points, albedo = _surface_points(scene, dr.gather(mi.SurfaceInteraction3f, si, here))
-    weights = _filter_weights(film.rfilter(), places, width, height)[:, kept]
+    weights = filter_weights(film.rfilter(), places, width, height)[:, kept]
     return Measurement(
         keys=points.keys,
         areas=np.ones(len(kept), np.float32),
@@ -63,8 +63,14 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     )
 
 
-def _jittered(width: int, height: int, spp: int, seed: int) -> NDArray[np.float32]:
-    """Places (width * height * spp, 2) in pixels: one in each of some strata of a pixel, pixels row by row."""
+def jittered_places(width: int, height: int, spp: int, seed: int) -> NDArray[np.float32]:
+    """Places (width * height * spp, 2) in pixels: one in each of some strata of a pixel, pixels row by row.
+
+    Raises
+    ------
+    PrtError
+        If there is to be less than one.
+    """
     if spp != int(spp) or spp < 1:
         raise PrtError(f"spp is {spp}; it must be a whole number of at least 1")
     rows = max(k for k in range(1, int(np.sqrt(spp)) + 1) if spp % k == 0)
@@ -97,7 +103,7 @@ def _surface_points(scene: Scene, si: mi.SurfaceInteraction3f) -> tuple[Points, 
     return points, np.ascontiguousarray(albedo)
 
 
-def _filter_weights(
+def filter_weights(
     rfilter: mi.ReconstructionFilter, places: NDArray[np.float32], width: int, height: int
 ) -> scipy.sparse.csr_array:
     """Weights (pixels, samples): the filter around the centre of each pixel, over its sum for all samples."""
