@@ -114,15 +114,33 @@ class Elements:
         m, total = len(self.samples), dr.zeros(mi.Color3f, len(self.samples))
         if not m or not len(ids):
             return np.zeros((m, 3), np.float32)
-        column, factor = mi.UInt32(np.asarray(ids, np.uint32)), _colours(weights)
+        column, factor, lane = (
+            mi.UInt32(np.asarray(ids, np.uint32)),
+            _colours(weights),
+            dr.arange(mi.UInt32, m),
+        )
         for first, count in _pieces(len(ids), max(1, LANES // m)):
-            total = self._accumulated(total, column, factor, first, count)
+            total = self._accumulated(total, lane, column, factor, first, count)
             dr.eval(total)
             done(m * count)
         self.evaluated += m * len(ids)
         found = np.ascontiguousarray(total.numpy().T)
         self._check_sum(found, ids)
         return found
+
+    def sum_of_rows(self, first: int, count: int, done: Done = lambda _: None) -> Floats:
+        """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
+        n = len(self.lights)
+        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        column, factor = dr.arange(mi.UInt32, n), dr.full(mi.Color3f, 1, n)
+        found = np.zeros((count, 3))
+        for start, size in _pieces(n, max(1, LANES // max(count, 1))):
+            part = self._accumulated(dr.zeros(mi.Color3f, count), lane, column, factor, start, size)
+            found += part.numpy().T
+            done(count * size)
+        self.evaluated += n * count
+        self._check_sum(found.astype(np.float32), np.arange(n), first)
+        return found.astype(np.float32)
 
     def each_column(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Iterator[Floats]:
         """The columns (m, 3) that ``sum_columns`` adds up, one after the other."""
@@ -228,10 +246,16 @@ class Elements:
 
     @dr.syntax
     def _accumulated(
-        self, total: mi.Color3f, columns: mi.UInt32, weights: mi.Color3f, first: mi.UInt32, count: int
+        self,
+        total: mi.Color3f,
+        samples: mi.UInt32,
+        columns: mi.UInt32,
+        weights: mi.Color3f,
+        first: mi.UInt32,
+        count: int,
     ) -> mi.Color3f:
         """A lane for each sample; the lights are a loop inside of the kernel."""
-        at = self.samples.receivers(dr.arange(mi.UInt32, len(self.samples)))
+        at = self.samples.receivers(samples)
         total, k, last = mi.Color3f(total), mi.UInt32(first), first + dr.opaque(mi.UInt32, count)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, columns, k))
@@ -277,10 +301,10 @@ class Elements:
         dr.eval(norms, x, y, z)
         return norms, [x, y, z]
 
-    def _check_sum(self, found: Floats, columns: Ids) -> None:
+    def _check_sum(self, found: Floats, columns: Ids, first: int = 0) -> None:
         bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
         if len(bad):
-            self.block(bad[:1], columns)  # names it
+            self.block(bad[:1] + first, columns)  # names it
 
     def _check_rows(self, norms: Floats, rows: Ids) -> None:
         bad = np.flatnonzero(~np.isfinite(norms).all(axis=1))

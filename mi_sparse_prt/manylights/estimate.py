@@ -178,8 +178,9 @@ def sum_with_error(
     once = np.setdiff1d(np.arange(len(partition)), twice)
     values = elements.sum_columns(first.ids[once], first.weights[once], done)
     squared = 0.0
-    ids, weights = (np.stack([a[twice], b[twice]], axis=1) for a, b in zip(first, second, strict=True))
-    columns = elements.each_column(ids.ravel(), weights.reshape(-1, 3), done)
+    ids = np.stack([first.ids[twice], second.ids[twice]], axis=1).ravel()
+    weights = np.stack([first.weights[twice], second.weights[twice]], axis=1).reshape(-1, 3)
+    columns = elements.each_column(ids, weights, done)
     for k, x, y in zip(twice, columns, columns, strict=False):
         values += (x + y) / 2
         variance = float(np.square(elements.samples.pixel_means(x - y), dtype=np.float64).sum()) / 2

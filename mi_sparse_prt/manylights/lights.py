@@ -191,7 +191,7 @@ class _Source:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         si.p = self.centre
         found, weight = self.emitters[self.environment].sample_direction(si, uv)
-        return found.d, mi.Color3f(weight)
+        return found.d, mi.Color3f(weight) + dr.zeros(mi.Color3f, dr.width(uv))  # where it is the same everywhere
 
     def rays(self, number: mi.UInt32, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Color3f]:
         """Rays that emitters send out, and their flux over the density; those of an environment fill the sphere."""
@@ -200,7 +200,7 @@ class _Source:
         u, place, direction = rng.next_float32(), next_2d(rng), next_2d(rng)
         ray, flux = pointer.sample_ray(mi.Float(0), u, place, direction, ~far)
         if self.environment < 0:
-            return mi.Ray3f(ray), mi.Color3f(flux)
+            return mi.Ray3f(ray), mi.Color3f(flux) + dr.zeros(mi.Color3f, dr.width(number))
         towards, irradiance = self.directions(direction)
         across = mi.warp.square_to_uniform_disk_concentric(place) * self.radius
         frame = mi.Frame3f(towards)
@@ -327,7 +327,7 @@ def _area(source: _Source, number: int, count: int, seed: int) -> _Part:
     si.p, si.n, si.uv, si.wi = found.p, found.n, found.uv, mi.Vector3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(found.n)
     si.t, si.shape = mi.Float(0), shape
-    radiance = mi.Color3f(source.emitters[number].eval(si))
+    radiance = mi.Color3f(source.emitters[number].eval(si)) + dr.zeros(mi.Color3f, size)
     lights = no_lights(size)
     lights.kind = dr.full(mi.UInt32, COSINE, size)
     lights.place, lights.normal = found.p, mi.Vector3f(found.n)

@@ -9,14 +9,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.manylights.particles import next_2d
 from mi_sparse_prt.manylights.surfaces import Surfaces, diffuse_value
-from mi_sparse_prt.measurement.pixels import filter_weights, jittered_places
+from mi_sparse_prt.measurement.pixels import jittered_places
 from mi_sparse_prt.scene.instances import placed_shapes
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
@@ -128,11 +127,6 @@ class Samples:
         found = (w.name for w in placed_shapes(self._scene) if dr.all(met == mi.ShapePtr(w.shape)))
         return f"shape '{next(found, 'of an instance')}' (pixel {x}, {y})"
 
-    @cached_property
-    def weights(self) -> scipy.sparse.csr_array:
-        """The reconstruction filter: (pixels, n_samples)."""
-        return filter_weights(self._rfilter, self._places, *self.shape[::-1])
-
     def image(self, values: Floats) -> Floats:
         """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
         every = self.seen.copy()
@@ -140,12 +134,32 @@ class Samples:
         return self.filtered(every)
 
     def filtered(self, every: Floats) -> Floats:
-        """Pixels (height, width, channels) of values (n_samples, channels)."""
-        return np.asarray(self.weights @ every, np.float32).reshape(*self.shape, -1)
+        """Pixels (height, width, channels) of values (n_samples, channels), by the reconstruction filter."""
+        height, width = self.shape
+        reach = int(np.ceil(self._rfilter.radius() - 0.5))
+        values = np.append(every, np.ones_like(every[:, :1]), axis=1)  # the last channel: sums of weights
+        values = values.reshape(height, width, self.spp, -1)
+        away = self._places.reshape(height, width, self.spp, 2) % 1 - np.float32(0.5)
+        # filters are separable: of each offset along an axis, what it weighs
+        x, y = ([self._rfilter_at(away[..., k], d) for d in range(-reach, reach + 1)] for k in range(2))
+        total = np.zeros((height + 2 * reach, width + 2 * reach, values.shape[-1]), np.float32)
+        for j, along_y in enumerate(y):
+            for i, along_x in enumerate(x):
+                weighted = np.einsum("yxs,yxsc->yxc", along_x * along_y, values)
+                total[j : j + height, i : i + width] += weighted
+        kept = total[reach : reach + height, reach : reach + width]
+        scale = np.divide(1, kept[..., -1:], out=np.zeros_like(kept[..., -1:]), where=kept[..., -1:] != 0)
+        return kept[..., :-1] * scale
+
+    def _rfilter_at(self, away: Floats, offset: int) -> Floats:
+        """The filter around the centre of another pixel of a row or column."""
+        at = mi.Float(np.ascontiguousarray(away - np.float32(offset)).ravel())
+        return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
     def pixel_means(self, values: Floats) -> Floats:
         """Means (pixels, 3) of what rows add to their pixels, (m, 3); of those pixels that have rows."""
-        return np.add.reduceat(values, self._first_rows, axis=0) / np.float32(self.spp)
+        sums: Floats = np.add.reduceat(values, self._first_rows, axis=0, dtype=np.float32)
+        return sums / np.float32(self.spp)
 
     @cached_property
     def _first_rows(self) -> NDArray[np.int64]:

@@ -48,7 +48,7 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
         raise PrtError("the camera sees no surface that reflects; move it, or choose another sensor")
     here = mi.UInt32(kept.astype(np.uint32))
     points, albedo = _surface_points(scene, dr.gather(mi.SurfaceInteraction3f, si, here))
-    weights = filter_weights(film.rfilter(), places, width, height)[:, kept]
+    weights = _filter_weights(film.rfilter(), places, width, height)[:, kept]
     return Measurement(
         keys=points.keys,
         areas=np.ones(len(kept), np.float32),
@@ -103,7 +103,7 @@ def _surface_points(scene: Scene, si: mi.SurfaceInteraction3f) -> tuple[Points, 
     return points, np.ascontiguousarray(albedo)
 
 
-def filter_weights(
+def _filter_weights(
     rfilter: mi.ReconstructionFilter, places: NDArray[np.float32], width: int, height: int
 ) -> scipy.sparse.csr_array:
     """Weights (pixels, samples): the filter around the centre of each pixel, over its sum for all samples."""
