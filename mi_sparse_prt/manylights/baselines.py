@@ -34,10 +34,11 @@ def all_lights(elements: Elements, run: Run, folder: Path | None = None) -> Floa
     found = np.zeros((m, 3), np.float32)
     kept = Checkpoint(folder / f"all_lights_{_hash(elements)}.rows", found) if folder is not None else None
     first = 0 if kept is None else kept.rows_done
-    with run.bar(m * n, "all lights", " elements", first * n) as bar:
+    with run.bar(m, "all lights", " samples", first) as bar:
         for a in range(first, m if n else 0, RECORD):
             part = slice(a, min(a + RECORD, m))
-            found[part] = elements.sum_of_rows(a, part.stop - a, bar.update)
+            found[part] = elements.sum_of_rows(a, part.stop - a)
+            bar.update(part.stop - a)
             if kept is not None:
                 kept.append(found[part])
     return found

@@ -22,7 +22,7 @@ ROWS = 16  # whose projections are added up at a time: sums are the same however
 
 Floats = NDArray[np.float32]
 Ids = NDArray[np.integer]
-Done = Callable[[int], object]  # is told how many elements more are done
+Done = Callable[[int], object]  # is told how many rows or columns more are done
 
 
 class ReducedColumns(NamedTuple):
@@ -122,13 +122,13 @@ class Elements:
         for first, count in _pieces(len(ids), max(1, LANES // m)):
             total = self._accumulated(total, lane, column, factor, first, count)
             dr.eval(total)
-            done(m * count)
+            done(count)
         self.evaluated += m * len(ids)
         found = np.ascontiguousarray(total.numpy().T)
         self._check_sum(found, ids)
         return found
 
-    def sum_of_rows(self, first: int, count: int, done: Done = lambda _: None) -> Floats:
+    def sum_of_rows(self, first: int, count: int) -> Floats:
         """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
         n = len(self.lights)
         lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
@@ -137,7 +137,6 @@ class Elements:
         for start, size in _pieces(n, max(1, LANES // max(count, 1))):
             part = self._accumulated(dr.zeros(mi.Color3f, count), lane, column, factor, start, size)
             found += part.numpy().T
-            done(count * size)
         self.evaluated += n * count
         self._check_sum(found.astype(np.float32), np.arange(n), first)
         return found.astype(np.float32)
@@ -149,7 +148,7 @@ class Elements:
         for first, count in _pieces(len(ids), max(1, LANES // max(m, 1))):
             found = self._kept(column, factor, first, count).numpy().reshape(3, count, m)
             self.evaluated += m * count
-            done(m * count)
+            done(count)
             for k in range(count):
                 values = np.ascontiguousarray(found[:, k].T)
                 self._check_sum(values, ids)
@@ -184,7 +183,7 @@ class Elements:
             for b in range(0, count, ROWS):
                 own = slice(b, min(b + ROWS, count))
                 projected += block[own].T @ projection[a + own.start : a + own.stop]
-            done(n * count)
+            done(count)
         self.evaluated += n * len(rows)
         channels = np.stack([square.numpy() for square in squares], axis=1).astype(np.float64)
         return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels))

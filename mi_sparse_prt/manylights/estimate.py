@@ -170,7 +170,7 @@ def sum_with_error(
     partition : Partition
     rng : np.random.Generator
     done : callable
-        Is told how many elements more are done.
+        Is told how many columns more are done.
     """
     first, second = draw_representatives(partition, rng), draw_representatives(partition, rng)
     chance = _chances(partition)

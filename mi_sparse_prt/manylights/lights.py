@@ -191,7 +191,9 @@ class _Source:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         si.p = self.centre
         found, weight = self.emitters[self.environment].sample_direction(si, uv)
-        return found.d, mi.Color3f(weight) + dr.zeros(mi.Color3f, dr.width(uv))  # where it is the same everywhere
+        return found.d, mi.Color3f(weight) + dr.zeros(
+            mi.Color3f, dr.width(uv)
+        )  # where it is the same everywhere
 
     def rays(self, number: mi.UInt32, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Color3f]:
         """Rays that emitters send out, and their flux over the density; those of an environment fill the sphere."""

@@ -264,7 +264,7 @@ def _specular(
     # a coat, or something else that reflects into single directions, beside what spreads light
     mixed = active & smooth & bent & ~hole
     _, guess = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), mixed & ~null)
-    p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.05, 0.95))
+    p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.2, 0.8))
     follows = mixed & (choice < p_bent)
     some, its = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), follows & ~null)
     only = active & ~smooth
