@@ -51,7 +51,7 @@ Clamp = Annotated[
     float | None,
     typer.Option(
         help="Largest geometry term of indirect lights, 1 / (unit of the scene)^2.",
-        show_default="that of surfaces at 1/20 of the scene's radius",
+        show_default="that of surfaces at 1/10 of the scene's radius",
     ),
 ]
 Camera = Annotated[int, typer.Option(help="Which of the scene's sensors.")]

@@ -31,7 +31,7 @@ from mi_sparse_prt.manylights.surfaces import Surfaces
 
 AREA, SUN = "AreaLight", "SunskyEmitter"
 SUN_RADIUS = np.deg2rad(1.0)  # around the brightest direction: a sun and its rim
-NEAR = 0.05  # radii of the scene, at which surfaces that face each other have the largest geometry term
+NEAR = 0.1  # radii of the scene, at which surfaces that face each other have the largest geometry term
 PLACED = ("PointLight", "SpotLight", "Projector", "DirectionalEmitter")  # a light each, as they are
 NONE = 0xFFFFFFFF
 FEWEST = 16  # lights of an area lamp, however dim
@@ -55,7 +55,7 @@ class LightOptions:
         As ``path`` counts: 2 is direct light, 3 one reflection more; -1 for no limit but Russian roulette.
     clamp : float, optional
         Largest geometry term (cos cos / distance^2, in 1 / unit^2) of indirect lights; inf for none. By default that of
-        two surfaces that face each other at a twentieth of the radius of the scene's bounding sphere.
+        two surfaces that face each other at a tenth of the radius of the scene's bounding sphere.
     seed : int
     """
 
@@ -186,14 +186,13 @@ class _Source:
         index = mi.UInt32(np.asarray(numbers, np.uint32))
         return dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
 
-    def directions(self, uv: mi.Point2f) -> tuple[mi.Vector3f, mi.Color3f]:
-        """Directions towards the environment, and its radiance over their density: means are irradiance."""
+    def directions(self, uv: mi.Point2f) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+        """Directions towards the environment, its radiance over their density, whose mean is irradiance, and that."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         si.p = self.centre
         found, weight = self.emitters[self.environment].sample_direction(si, uv)
-        return found.d, mi.Color3f(weight) + dr.zeros(
-            mi.Color3f, dr.width(uv)
-        )  # where it is the same everywhere
+        even = dr.zeros(mi.Float, dr.width(uv))  # numbers may be the same everywhere
+        return found.d, mi.Color3f(weight) + even, found.pdf + even
 
     def rays(self, number: mi.UInt32, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Color3f]:
         """Rays that emitters send out, and their flux over the density; those of an environment fill the sphere."""
@@ -203,7 +202,7 @@ class _Source:
         ray, flux = pointer.sample_ray(mi.Float(0), u, place, direction, ~far)
         if self.environment < 0:
             return mi.Ray3f(ray), mi.Color3f(flux) + dr.zeros(mi.Color3f, dr.width(number))
-        towards, irradiance = self.directions(direction)
+        towards, irradiance, _ = self.directions(direction)
         across = mi.warp.square_to_uniform_disk_concentric(place) * self.radius
         frame = mi.Frame3f(towards)
         origin = self.centre + frame.s * across.x + frame.t * across.y + towards * self.radius
@@ -274,11 +273,11 @@ def _distant(source: _Source, count: int, seed: int) -> _Part:
         return _part(no_lights(0), source.environment)
     sun = source.emitters[source.environment].class_name() == SUN
     if sun:  # as many samples as leave so many lights in the sky
-        direction, power = _directions(source, PILOT, seed)
-        count = round(count / max(1 - _in_sun(direction, power).mean(), 0.05))
-    direction, power = _directions(source, count, seed)
+        direction, _, radiance = _directions(source, PILOT, seed)
+        count = round(count / max(1 - _in_sun(direction, radiance).mean(), 0.05))
+    direction, power, radiance = _directions(source, count, seed)
     if sun:
-        inside = _in_sun(direction, power)
+        inside = _in_sun(direction, radiance)
         mean = power[inside].sum(axis=1) @ direction[inside]
         direction = np.concatenate([direction[~inside], mean[None] / max(np.linalg.norm(mean), 1e-30)])
         power = np.concatenate([power[~inside], power[inside].sum(axis=0, keepdims=True)])
@@ -289,17 +288,18 @@ def _distant(source: _Source, count: int, seed: int) -> _Part:
     return _part(lights, source.environment)
 
 
-def _directions(source: _Source, count: int, seed: int) -> tuple[Doubles, Doubles]:
-    """Unit vectors (n, 3) and irradiance (n, 3), about ``count`` of them."""
+def _directions(source: _Source, count: int, seed: int) -> tuple[Doubles, Doubles, Doubles]:
+    """Unit vectors (n, 3), irradiance (n, 3) and radiance (n,), about ``count`` of them."""
     uv = _stratified(count, _random(_square(count), seed, _DIRECTIONS))
-    towards, weight = source.directions(uv)
+    towards, weight, density = source.directions(uv)
     power = weight.numpy().T.astype(np.float64)
-    return towards.numpy().T.astype(np.float64), power / len(power)
+    radiance = power.mean(axis=1) * density.numpy()
+    return towards.numpy().T.astype(np.float64), power / len(power), radiance
 
 
-def _in_sun(direction: Doubles, power: Doubles) -> NDArray[np.bool_]:
+def _in_sun(direction: Doubles, radiance: Doubles) -> NDArray[np.bool_]:
     """Which directions are within the rim of the brightest one."""
-    return np.asarray(direction @ direction[power.sum(axis=1).argmax()] > np.cos(SUN_RADIUS))
+    return np.asarray(direction @ direction[radiance.argmax()] > np.cos(SUN_RADIUS))
 
 
 def _placed(source: _Source, power: Doubles) -> _Part:
