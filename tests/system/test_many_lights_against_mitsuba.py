@@ -57,7 +57,8 @@ def all_lights_image(scene: mi.Scene, max_depth: int, seed: int) -> np.ndarray:
     """By all lights, without a clamp."""
     surfaces = Surfaces(scene)
     samples = Samples(scene, surfaces, scene.sensors()[0], 16, max_depth, seed)
-    options = LightOptions(1000, max_depth=max_depth, clamp=np.inf, seed=seed)
+    count = 1000 if max_depth == 2 else 3000
+    options = LightOptions(count, max_depth=max_depth, clamp=np.inf, seed=seed)
     elements = Elements(scene, surfaces, samples, scene_lights(scene, options))
     return samples.image(elements.sum_of_rows(0, len(samples)))
 
