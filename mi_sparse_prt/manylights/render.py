@@ -174,7 +174,7 @@ def render_many_lights(
     run = Run(asked.seed, progress=progress)
     with run.clock.phase("load"):
         view = find_view(scene, sensor)
-    found = RowColumn(view, asked, run)
+    found = RowColumn(matrix_of(view, asked, run), asked, run)
     estimate = found.estimate(preview)
     return found.picture(estimate)
 
@@ -201,27 +201,31 @@ def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> 
     return scene, sensor
 
 
+def matrix_of(view: View, settings: Settings, run: Run) -> Elements:
+    """The matrix of a view; samples and lights are phases of the run's clock."""
+    scene, sensor = view
+    surfaces = Surfaces(scene)
+    with run.clock.phase("samples"):
+        samples = Samples(scene, surfaces, sensor, settings.spp, settings.max_depth, settings.seed)
+    with run.clock.phase("lights"):
+        lights = scene_lights(scene, settings.light_options())
+    return Elements(scene, surfaces, samples, lights)
+
+
 class RowColumn:
-    """Matrix row-column sampling of one view, step by step.
+    """Matrix row-column sampling of one matrix, step by step.
 
     Parameters
     ----------
-    view : tuple
-        Scene and sensor.
+    elements : Elements
     settings : Settings
     run : Run
-        Its clock tells where time goes; samples and lights are the phases ``samples`` and ``lights``.
+        Its clock tells where time goes.
     """
 
-    def __init__(self, view: View, settings: Settings, run: Run) -> None:
-        scene, sensor = view
-        self.settings, self.run, self.sensor = settings, run, sensor
-        surfaces = Surfaces(scene)
-        with run.clock.phase("samples"):
-            self.samples = Samples(scene, surfaces, sensor, settings.spp, settings.max_depth, settings.seed)
-        with run.clock.phase("lights"):
-            self.lights = scene_lights(scene, settings.light_options())
-        self.elements = Elements(scene, surfaces, self.samples, self.lights)
+    def __init__(self, elements: Elements, settings: Settings, run: Run) -> None:
+        self.elements, self.settings, self.run = elements, settings, run
+        self.samples, self.lights = elements.samples, elements.lights
         self.rows, self.columns = settings.rows, settings.columns
 
     def costs(self) -> Costs:
