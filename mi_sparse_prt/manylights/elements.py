@@ -198,21 +198,22 @@ class Elements:
     ) -> tuple[mi.Color3f, mi.Vector3f, mi.Mask]:
         """As if nothing was between; the direction towards the light, and in which lanes there is any.
 
-        The geometry term of indirect lights is at most ``lights.clamp``.
+        The geometry term of indirect lights is at most ``lights.clamp``, times what either BSDF has more than a white
+        diffuse one.
         """
         active = active & (light.depth + at.depth <= dr.opaque(mi.UInt32, self._max_depth))
         found = arriving(light, at.si.p, self.lights.kinds, active)
         out = at.si.to_local(found.direction)
         cosine = mi.Frame3f.cos_theta(out)
-        near = dr.abs(cosine) * found.cosine
-        clamp = dr.opaque(mi.Float, min(self.lights.clamp, 1e30))
-        scale = dr.select((light.depth > 2) & (near > clamp), clamp / near, 1)
         above = cosine * mi.Frame3f.cos_theta(at.si.wi) > 0
-        value = dr.select(at.diffuse & above, dr.abs(cosine), 0) * at.weight
+        value, largest = dr.select(at.diffuse & above, dr.abs(cosine), 0) * at.weight, dr.abs(cosine)
         if not self.surfaces.all_lambertian:
             own = active & ~at.diffuse & ~dr.all(found.irradiance == 0)
             bsdf = at.si.bsdf().eval(mi.BSDFContext(), at.si, out, own)
             value = dr.select(at.diffuse, value, bsdf * at.weight)
+            largest = dr.maximum(largest, dr.select(own, dr.pi * dr.max(bsdf), 0))
+        near, clamp = largest * found.cosine, dr.opaque(mi.Float, min(self.lights.clamp, 1e30))
+        scale = dr.select((light.depth > 2) & (near > clamp), clamp / near, 1)
         value *= found.irradiance * scale
         return value, found.direction, active & ~dr.all(value == 0)  # NaN is lit, so that it is noticed
 

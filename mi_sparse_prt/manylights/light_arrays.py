@@ -59,7 +59,8 @@ class Arriving(NamedTuple):
     irradiance : Color3f
         At right angles to it.
     cosine : Float
-        Geometry term without the cosine at the point, in 1 / unit^2: cos / distance^2. 0 of lights that have none.
+        Geometry term without the cosine at the point, in 1 / unit^2: cos / distance^2, or more where a glossy surface
+        sends more light than a white diffuse one would. 0 of lights that have none.
     """
 
     direction: Any
@@ -134,6 +135,7 @@ def arriving(light: LightArrays, p: mi.Point3f, kinds: LightKinds, active: mi.Ma
         out = si.to_local(-direction)
         value = si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, out, own)
         turned = dr.abs(dr.dot(light.normal, direction)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(out)), 1e-4)
-        reflected = light.power * value * (turned / square)
-        irradiance = dr.select(light.kind == SURFACE, dr.select(own, reflected, 0), irradiance)
+        scale = dr.select(own, turned / square, 0)
+        irradiance = dr.select(light.kind == SURFACE, light.power * value * scale, irradiance)
+        cosine = dr.maximum(cosine, dr.select(own, dr.pi * dr.max(value) * scale, 0))
     return Arriving(direction, irradiance, cosine)

@@ -54,7 +54,8 @@ class LightOptions:
     max_depth : int
         As ``path`` counts: 2 is direct light, 3 one reflection more; -1 for no limit but Russian roulette.
     clamp : float, optional
-        Largest geometry term (cos cos / distance^2, in 1 / unit^2) of indirect lights; inf for none. By default that of
+        Largest geometry term (cos cos / distance^2, in 1 / unit^2) of indirect lights, with glossy reflection counted
+        in as far as it is more than that of white diffuse surfaces; inf for none. By default that of
         two surfaces that face each other at a tenth of the radius of the scene's bounding sphere.
     seed : int
     """

@@ -138,10 +138,10 @@ def room() -> str:
     """A closed room with a counter; lamps above it and behind partitions."""
     things = [
         diffuse("plaster", (0.7, 0.68, 0.62)),
-        principled("floor", (0.4, 0.28, 0.18), 0.25),
-        principled("steel", (0.7, 0.7, 0.72), 0.3, 1),
-        principled("lacquer", (0.15, 0.3, 0.42), 0.2),
-        principled("copper", (0.85, 0.45, 0.3), 0.35, 1),
+        principled("floor", (0.4, 0.28, 0.18), 0.45),
+        principled("steel", (0.7, 0.7, 0.72), 0.45, 1),
+        principled("lacquer", (0.15, 0.3, 0.42), 0.4),
+        principled("copper", (0.85, 0.45, 0.3), 0.45, 1),
         box("ground", (-3, -0.1, -2.5), (3, 0, 2.5), "floor"),
         box("ceiling", (-3, 2.8, -2.5), (3, 2.9, 2.5), "plaster"),
         box("north", (-3, 0, -2.6), (3, 2.8, -2.5), "plaster"),
