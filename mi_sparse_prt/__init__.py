@@ -15,6 +15,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.emission.cubemap import CubemapLighting
     from mi_sparse_prt.emission.emitters import SceneEmitters
     from mi_sparse_prt.emission.environment import Environment, load_environment
+    from mi_sparse_prt.manylights.render import ManyLightsImage, render_many_lights
     from mi_sparse_prt.measurement.measurement import mesh_vertices
     from mi_sparse_prt.measurement.pixels import camera_pixels
     from mi_sparse_prt.precompute import precompute, precompute_glossy
@@ -38,6 +39,7 @@ _MODULES = {
     "FixedCamera": "relighting.fixed_camera",
     "GlossyTransport": "transport",
     "LightTransport": "transport",
+    "ManyLightsImage": "manylights.render",
     "Page": "relighting.viewer.export",
     "Relighter": "relighting.relighter",
     "Scene": "scene.scene",
@@ -55,6 +57,7 @@ _MODULES = {
     "precompute": "precompute",
     "precompute_glossy": "precompute",
     "render": "relighting.image",
+    "render_many_lights": "manylights.render",
     "show": "relighting.viewer.widget",
     "validate": "validation.validate",
 }
@@ -65,6 +68,7 @@ __all__ = [
     "FixedCamera",
     "GlossyTransport",
     "LightTransport",
+    "ManyLightsImage",
     "Page",
     "PrtError",
     "PrtWarning",
@@ -84,6 +88,7 @@ __all__ = [
     "precompute",
     "precompute_glossy",
     "render",
+    "render_many_lights",
     "show",
     "validate",
     "variant",

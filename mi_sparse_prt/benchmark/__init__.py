@@ -3,6 +3,7 @@
 from mi_sparse_prt.benchmark.clustered_pca import measure_cpca
 from mi_sparse_prt.benchmark.gallery import draw_gallery, save_gallery
 from mi_sparse_prt.benchmark.glossy_transport import measure_glossy
+from mi_sparse_prt.benchmark.many_lights import measure_many_lights
 from mi_sparse_prt.benchmark.method_comparison import measure_methods
 from mi_sparse_prt.benchmark.moving_light import measure_moving_light
 from mi_sparse_prt.benchmark.page_errors import measure_pages
@@ -19,6 +20,7 @@ __all__ = [
     "measure_choices",
     "measure_cpca",
     "measure_glossy",
+    "measure_many_lights",
     "measure_methods",
     "measure_moving_light",
     "measure_pages",

@@ -25,6 +25,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.methods.dense_sampling import Dense
 from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.huang2010 import Huang2010Options, huang2010_parts
+from mi_sparse_prt.sampling.row_column import cluster_columns
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -32,13 +33,11 @@ from mi_sparse_prt.solvers.problem import diffuse_problem
 from mi_sparse_prt.transport import LightTransport
 
 Ids = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 Columns = Callable[[Singles, int, np.random.Generator], Ids]
 
 SHARE = 0.06  # of the columns are sampled ([HR10] Figure 5)
-BY_SAMPLING = 2 / 3  # of the clusters; the others are made by splitting ([HPB07] 3.5)
 LLOYD_STEPS = 10
 
 
@@ -137,15 +136,7 @@ def clustered_columns(rows: NDArray[np.float32], count: int, rng: np.random.Gene
     ids, single = _lit_columns(rows)
     x = single.astype(np.float64)
     norms = np.linalg.norm(x, axis=1)
-    count = min(count, len(ids))
-    clusters = _clusters_by_sampling(x, norms, min(count, max(1, round(BY_SAMPLING * count))), rng)
-    costs = [_cost(x[members], norms[members]) for members in clusters]
-    while len(clusters) < count:
-        dearest = int(np.argmax(costs))
-        pieces = _split(x, norms, clusters.pop(dearest), rng)
-        costs.pop(dearest)
-        clusters.extend(pieces)
-        costs.extend(_cost(x[members], norms[members]) for members in pieces)
+    clusters = cluster_columns(x, norms, count, rng)
     chosen = [rng.choice(members, p=norms[members] / norms[members].sum()) for members in clusters]
     return np.sort(ids[np.array(chosen, np.int64)])
 
@@ -196,55 +187,6 @@ def _lit_columns(rows: NDArray[np.float32]) -> tuple[Ids, Singles]:
     """Columns that are not zero: their ids (n,) and values (n, r)."""
     ids = np.flatnonzero(rows.any(axis=0))
     return ids, np.ascontiguousarray(rows[:, ids].T, dtype=np.float32)
-
-
-# -- clustering by direction [HPB07] -----------------------------------------------------------------------------------
-
-
-def _clusters_by_sampling(x: Floats, norms: Floats, count: int, rng: np.random.Generator) -> list[Ids]:
-    """Columns (n, r) to the nearest of `count` centres, whose norms are scaled by how unlikely they were drawn."""
-    if not count:
-        return []
-    alpha = np.maximum(norms * norms.sum() - x @ x.sum(axis=0), 0)  # cost of a column beside all others
-    p = alpha / alpha.sum() if alpha.any() else np.full(len(x), 1 / len(x))
-    centres, times = _drawn(p, count, rng)
-    distance = norms[:, None] * norms[centres] - x @ x[centres].T  # [column, centre]
-    owner = np.argmin(np.maximum(distance, 0) * (times / p[centres]), axis=1)
-    owner[centres] = np.arange(len(centres))  # where rounding, or a parallel centre, would leave one empty
-    return [np.flatnonzero(owner == k) for k in range(len(centres))]
-
-
-def _drawn(p: Floats, count: int, rng: np.random.Generator) -> tuple[Ids, Ids]:
-    """Items drawn with probabilities p, with replacement, until `count` are distinct; and how often each came.
-
-    In continuous time, at rates p: when an item first comes is an exponential number, and how often it comes again
-    before the last one does is a Poisson number.
-    """
-    first = np.full(len(p), np.inf)
-    np.divide(rng.exponential(size=len(p)), p, out=first, where=p > 0)
-    items = np.argsort(first, kind="stable")[: min(count, int((p > 0).sum()))]
-    return items, 1 + rng.poisson(p[items] * (first[items[-1]] - first[items]))
-
-
-def _cost(x: Floats, norms: Floats) -> float:
-    """Cost of a cluster of columns (n, r); -1 where there is nothing to split."""
-    return float(_costs_of_first(x, norms)[-1]) if len(x) > 1 else -1.0
-
-
-def _costs_of_first(x: Floats, norms: Floats) -> Floats:
-    """Costs (n,) of the clusters of the first 1, 2, ..., n columns."""
-    cost = np.cumsum(norms) ** 2 - (np.cumsum(x, axis=0) ** 2).sum(axis=1)
-    return np.maximum(np.asarray(cost, np.float64), 0)
-
-
-def _split(x: Floats, norms: Floats, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
-    """A cluster of two or more, cut at the best place along a random line of directions."""
-    along = x[members] @ rng.normal(size=x.shape[1]) / norms[members]
-    ordered = members[np.argsort(along, kind="stable")]
-    before = _costs_of_first(x[ordered], norms[ordered])[:-1]
-    after = _costs_of_first(x[ordered[::-1]], norms[ordered[::-1]])[:-1][::-1]
-    cut = 1 + int(np.argmin(before + after))
-    return ordered[:cut], ordered[cut:]
 
 
 # -- k-means -----------------------------------------------------------------------------------------------------------

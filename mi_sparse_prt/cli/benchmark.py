@@ -15,6 +15,7 @@ from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.running import check_folder, running
 
 WITHOUT_FIGURES = ("", "--plans")
+FROM_FILE = ("--sizes", "--many-lights")  # these load the scene themselves
 
 Repeats = Annotated[int, typer.Option(help="Timed repeats of every part, 3 at least; medians are reported.")]
 Methods = Annotated[
@@ -67,13 +68,19 @@ Pages = Annotated[
     bool,
     typer.Option("--pages", help="Measure sizes of pages for a browser against their errors instead."),
 ]
+ManyLights = Annotated[
+    bool,
+    typer.Option(
+        "--many-lights",
+        help="Measure time and error of matrix row-column sampling and its baselines instead.",
+    ),
+]
 Figures = Annotated[
     Path | None,
     options.file_option(
         metavar="FOLDER",
-        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy, --zoo, --relight or --pages "
-        "measures: "
-        "PNG files there.",
+        help="Draw what --method, --choices, --time-error, --sizes, --cpca, --glossy, --zoo, --relight, --pages or "
+        "--many-lights measures: PNG files there.",
     ),
 ]
 Place = Annotated[
@@ -98,6 +105,7 @@ def benchmark(
     zoo: Zoo = False,
     moving: Moving = False,
     pages: Pages = False,
+    many_lights: ManyLights = False,
     figures: Figures = None,
     edge_length: options.EdgeLength = None,
     define: options.Define = None,
@@ -115,7 +123,8 @@ def benchmark(
     With --cpca --figures FOLDER: compression, the paper's Figure 11. With --glossy --figures FOLDER: view-dependent
     images, its Figures 17 to 19. With --zoo --figures FOLDER: what is compatible, beside Mitsuba's path. With --relight
     --figures FOLDER: light that moves, Figures 2 to 9 of the paper on temporal coherence. With --pages
-    --figures FOLDER: what truncation costs in a browser.
+    --figures FOLDER: what truncation costs in a browser. With --many-lights --figures FOLDER: Figures 3 to 6 and Table
+    2 of the paper on row-column sampling; all lights are rendered first, which -D width=100 -D height=75 makes short.
 
     Ratios come from one run in which both sides alternate. Leave the machine alone meanwhile.
     """
@@ -130,6 +139,7 @@ def benchmark(
         "--zoo": zoo,
         "--relight": moving,
         "--pages": pages,
+        "--many-lights": many_lights,
     }
     which = _only_one(asked)
     varied = edge_length is not None or resolution != options.DEFAULT_RESOLUTION or (zoo and bool(define))
@@ -142,7 +152,7 @@ def benchmark(
             measure, show = _measurement(which, repeats, method or [])
             if scene is None or zoo:
                 command.report = measure(scene, progress, figures)
-            elif which == "--sizes":
+            elif which in FROM_FILE:
                 command.report = measure(scene, parameters, progress, figures)
             else:
                 case = prt.load_scene(scene, edge_length, **parameters), prt.CubemapLighting(resolution)
@@ -163,7 +173,7 @@ def _check(which: str, scene: Path | None, varied: bool, drawn: bool) -> None:
         raise typer.BadParameter("only --zoo can do without one", param_hint="SCENE")
     if drawn and which in WITHOUT_FIGURES:
         raise typer.BadParameter(f"there are none of {which or 'speed alone'}", param_hint="--figures")
-    if varied and which in ("--sizes", "--zoo"):
+    if varied and which in (*FROM_FILE, "--zoo"):
         own = "it chooses --edge-length and --resolution itself"
         raise typer.BadParameter(f"{own}, and takes no -D" if which == "--zoo" else own, param_hint=which)
 
@@ -183,6 +193,7 @@ def _measurement(
     from mi_sparse_prt import benchmark as benchmarks
     from mi_sparse_prt.cli.tables import benchmark as tables
     from mi_sparse_prt.cli.tables.choices import choices_tables
+    from mi_sparse_prt.cli.tables.many_lights import many_lights_tables
     from mi_sparse_prt.cli.tables.methods import methods_tables
     from mi_sparse_prt.cli.tables.moving_light import moving_light_tables
     from mi_sparse_prt.cli.tables.zoo import zoo_tables
@@ -202,5 +213,6 @@ def _measurement(
         "--zoo": (benchmarks.measure_zoo, zoo_tables),
         "--relight": (benchmarks.measure_moving_light, moving_light_tables),
         "--pages": (benchmarks.measure_pages, tables.pages_tables),
+        "--many-lights": (benchmarks.measure_many_lights, many_lights_tables),
     }
     return kinds[which]

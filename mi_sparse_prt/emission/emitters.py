@@ -277,23 +277,35 @@ def _coloured(value: Any) -> bool:
     return isinstance(value, mi.Color3f) or (isinstance(value, mi.TensorXf) and value.shape[-1] == 3)
 
 
-def meshes_of_emitters(scene: Scene) -> dict[int, int]:
-    """Numbers of the meshes that shine, by the numbers of their emitters."""
-    pointers = dr.reinterpret_array(mi.UInt32, scene.mitsuba.emitters_dr()).numpy().tolist()
+def shapes_of_emitters(scene: mi.Scene) -> dict[int, int]:
+    """Numbers of the shapes that shine, by the numbers of their emitters."""
+    pointers = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy().tolist()
     numbers = {pointer: k for k, pointer in enumerate(pointers)}
     return {
         numbers[int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(shape.emitter())).numpy()[0])]: k
-        for k, shape in enumerate(scene.mitsuba.shapes())
+        for k, shape in enumerate(scene.shapes())
         if shape.is_emitter()
     }
 
 
 def emitter_names(scene: Scene) -> dict[str, int]:
     """Numbers of all emitters by name: the mesh's, or the emitter's own id, or its kind."""
-    on_shapes = meshes_of_emitters(scene)
+    return named_emitters(scene.mitsuba, [mesh.name for mesh in scene.fronts])
+
+
+def named_emitters(scene: mi.Scene, shapes: Sequence[str]) -> dict[str, int]:
+    """Numbers of all emitters by name: the shape's, or the emitter's own id, or its kind.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    shapes : sequence of str
+        Names of its shapes.
+    """
+    on_shapes = shapes_of_emitters(scene)
     names: dict[str, int] = {}
-    for k, emitter in enumerate(scene.mitsuba.emitters()):
-        name = scene.fronts[on_shapes[k]].name if k in on_shapes else emitter.id()
+    for k, emitter in enumerate(scene.emitters()):
+        name = shapes[on_shapes[k]] if k in on_shapes else emitter.id()
         if not name or name.startswith("_"):  # Mitsuba's and ours for what has no name
             name = f"{emitter.class_name().lower()}_{k}"
         names[name if name not in names else f"{name}_{k}"] = k

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import hash_rows
-from mi_sparse_prt.emission.emitters import RADIATED, SceneEmitters, emitter_names, meshes_of_emitters
+from mi_sparse_prt.emission.emitters import RADIATED, SceneEmitters, emitter_names, shapes_of_emitters
 from mi_sparse_prt.scene.materials import digest, printed
 from mi_sparse_prt.scene.scene import Scene
 
@@ -68,7 +68,7 @@ class UnitLamps(SceneEmitters):
                 parameters.update(old)
 
     def _hash(self, scene: Scene) -> str:
-        state, meshes = hashlib.sha256(), meshes_of_emitters(scene)
+        state, meshes = hashlib.sha256(), shapes_of_emitters(scene.mitsuba)
         with self.at_unit_brightness():
             for name, lamp, (number,) in zip(self.names, self._lamps, self._members, strict=True):
                 state.update(f"|{name}|".encode())

@@ -41,7 +41,7 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     sensor = scene.sensor(sensor)
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
-    places = _jittered(width, height, spp, seed)
+    places = jittered_places(width, height, spp, seed)
     si, reflects = _seen(scene.mitsuba, sensor, places, (width, height))
     kept = np.flatnonzero(reflects)
     if not len(kept):
@@ -63,8 +63,14 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     )
 
 
-def _jittered(width: int, height: int, spp: int, seed: int) -> NDArray[np.float32]:
-    """Places (width * height * spp, 2) in pixels: one in each of some strata of a pixel, pixels row by row."""
+def jittered_places(width: int, height: int, spp: int, seed: int) -> NDArray[np.float32]:
+    """Places (width * height * spp, 2) in pixels: one in each of some strata of a pixel, pixels row by row.
+
+    Raises
+    ------
+    PrtError
+        If there is to be less than one.
+    """
     if spp != int(spp) or spp < 1:
         raise PrtError(f"spp is {spp}; it must be a whole number of at least 1")
     rows = max(k for k in range(1, int(np.sqrt(spp)) + 1) if spp % k == 0)

@@ -28,6 +28,7 @@ def _register(chosen: str | None) -> None:
     mi.register_sensor("mesh_vertices", _first_imported("MeshVertices", chosen))
     mi.register_emitter("cubemap", _first_imported("CubemapEmitter", chosen))
     mi.register_integrator("sparse_prt", _first_imported("SparsePRT", chosen))
+    mi.register_integrator("row_column", _first_imported("RowColumn", chosen))
     mi.register_bsdf("phong", _first_imported("Phong", chosen))
     mi.register_bsdf("ashikhmin_shirley", _first_imported("AshikhminShirley", chosen))
     mi.register_bsdf("in_out_factors", _first_imported("InOutFactors", chosen))

@@ -30,6 +30,21 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
     PrtError
         Another variant than rgb, missing file, XML or plugin error, and everything that `Scene.from_mitsuba` refuses.
     """
+    loaded, path = load_mitsuba(path, **parameters), Path(path)
+    try:
+        scene = Scene._build(loaded, edge_length)
+    except PrtError as error:
+        raise PrtError(f"scene file {path}: {error}") from error
+    scene.path = str(path)
+    scene._warn()
+    return scene
+
+
+def load_mitsuba(path: str | Path, **parameters: Any) -> mi.Scene:
+    """Load an XML scene as Mitsuba has it, with shapes in the file's order.
+
+    Parameters and errors are those of ``load_scene``, but for what the package makes of the scene.
+    """
     check_variant()
     path = Path(path)
     if not path.is_file():
@@ -41,13 +56,7 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
         raise PrtError(f"scene file {path} cannot be loaded: {reason}") from error
     if not isinstance(loaded, mi.Scene):
         raise PrtError(f"scene file {path} holds a {type(loaded).__name__}: its root element must be <scene>")
-    try:
-        scene = Scene._build(loaded, edge_length)
-    except PrtError as error:
-        raise PrtError(f"scene file {path}: {error}") from error
-    scene.path = str(path)
-    scene._warn()
-    return scene
+    return loaded
 
 
 def _one_line(error: Exception, limit: int = 400) -> str:

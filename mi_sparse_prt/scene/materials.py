@@ -62,6 +62,11 @@ def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
     return result
 
 
+def bends_normals(bsdf: mi.BSDF) -> bool:
+    """Whether a bump or normal map turns its shading normals; its flags do not tell."""
+    return bool(_classes(printed(bsdf)) & BUMPED)
+
+
 class Material:
     """A shape's BSDF, and what can be said about it.
 
@@ -110,8 +115,7 @@ class Material:
         """Look at a BSDF from its front (1) or its back (-1)."""
         self.bsdf, self._side = bsdf, side
         self._text = printed(bsdf)
-        # Mitsuba prints a plugin as Class[...]: this finds nested BSDFs and textures too.
-        self._classes = set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", self._text))
+        self._classes = _classes(self._text)
         flags = int(bsdf.flags())
         self._lambertian = _lambertian(bsdf)
         self.bends_normals = bool(self._classes & BUMPED)
@@ -248,6 +252,11 @@ def _not_diffuse(bsdf: mi.BSDF, lambertian: bool) -> Fact:
         'unless it is given terms="auto", indirect paths use the real BSDF'
     )
     return Fact(said.format("its"), said.format("their"), NotDiffuseWarning)
+
+
+def _classes(text: str) -> set[str]:
+    """What a plugin is made of: Mitsuba prints it as Class[...], nested BSDFs and textures too."""
+    return set(re.findall(r"^\w+|\b[A-Z]\w*(?=\[)", text))
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Texture | None:

@@ -245,26 +245,13 @@ class DirectSolver:
         depths = self.problem.depths_apart
         return [dr.select(passed.surfaces == k + 1, value, 0) for k in range(depths)] if depths else [value]
 
-    @dr.syntax
     def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:
         """Light that comes straight through surfaces, each of which counts as a bounce."""
-        depth = self.problem.max_depth
+        depth, apart = self.problem.max_depth, self.problem.depths_apart > 0
         most = dr.opaque(mi.UInt32, depth - 2 if depth >= 0 else 1 << 30)
-        apart, scatters = self.problem.depths_apart > 0, int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
-        share, count, boundary = mi.Float(1), mi.UInt32(0), mi.Mask(False)
-        ray, active = mi.Ray3f(ray), mi.Mask(active)
-        while active:
-            hit = self.scene.ray_intersect_preliminary(ray, active=active)
-            active &= hit.is_valid()
-            flags = hit.shape.bsdf().flags()
-            through = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (count < most)
-            si = hit.compute_surface_interaction(ray, active=through)
-            passed = dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
-            share = dr.select(active, dr.select(through, share * passed, 0), share)
-            count += dr.select(through, 1, 0)
-            boundary |= through & ((flags & scatters) == 0)
-            ray = si.spawn_ray(ray.d)
-            active &= share > 0
+        share, count, boundary = pass_straight(
+            self.scene, ray, active, most, lambda si: si.spawn_ray(ray.d), lambda passed: dr.mean(passed)
+        )
         return _Passed(share, count, (share >= ALL) & (~boundary if apart else True))
 
     def weighted_means(
@@ -312,6 +299,57 @@ class DirectSolver:
         v = (mi.Float(row) + rng.next_float32()) / self.strata
         direction, area = self._texels.inside(texel, u, v)
         return direction, area, dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)
+
+
+@dr.syntax
+def pass_straight(
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    active: mi.Mask,
+    most: mi.UInt32,
+    onwards: Callable[[Any], Any],
+    measure: Callable[[Any], Any],
+) -> tuple[Any, mi.UInt32, mi.Mask]:
+    """What surfaces let through straight on: masks, thin panes, ``null``.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    ray : Ray3f
+        May end somewhere.
+    active : Mask
+    most : UInt32
+        Surfaces that light may pass.
+    onwards : callable
+        Of an interaction: the rest of the ray.
+    measure : callable
+        Of a transmittance (Color3f): what is multiplied, a colour or one number.
+
+    Returns
+    -------
+    share : Color3f or Float
+        Of the light.
+    count : UInt32
+        Surfaces that it passed.
+    boundary : Mask
+        One of these does nothing but to let light through.
+    """
+    scatters = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Null)
+    share, count, boundary = measure(mi.Color3f(1)), mi.UInt32(0), mi.Mask(False)
+    ray, active = mi.Ray3f(ray), mi.Mask(active)
+    while active:
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        active &= hit.is_valid()
+        flags = hit.shape.bsdf().flags()
+        through = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (count < most)
+        si = hit.compute_surface_interaction(ray, active=through)
+        passed = measure(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
+        share = dr.select(active, dr.select(through, share * passed, 0), share)
+        count += dr.select(through, 1, 0)
+        boundary |= through & ((flags & scatters) == 0)
+        ray = onwards(si)
+        active &= dr.mean(mi.Color3f(share)) > 0
+    return share, count, boundary
 
 
 def _packed(seen: mi.Mask, texel: mi.UInt32) -> mi.UInt32:

@@ -69,6 +69,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "FAST": 9,
         "AFTER": 14,
     },
+    "06_many_lights": {
+        "SCENE": "leaves",
+        "IMAGE_WIDTH": 48,
+        "LIGHTS": 500,
+        "ROWS": 12,
+        "COLUMNS": 40,
+        "SEEDS": 2,
+    },
 }
 
 

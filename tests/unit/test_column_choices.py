@@ -23,9 +23,6 @@ from mi_sparse_prt.benchmark.column_sampling import (
     CHOICES as BY_REGION,
 )
 from mi_sparse_prt.benchmark.column_sampling import (
-    _costs_of_first,
-    _drawn,
-    _split,
     clustered_columns,
     k_means_columns,
     random_columns,
@@ -38,6 +35,7 @@ from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import Huang2010Options
 from mi_sparse_prt.sampling.angular import AngularGrid
+from mi_sparse_prt.sampling.row_column import costs_of_first, draw_distinct, split_cluster
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 RESOLUTION, VERTICES = 8, 40
@@ -110,7 +108,7 @@ def test_draws_are_those_of_a_loop() -> None:
     p, rng, n = np.array([0.5, 0.3, 0.1, 0.06, 0.04]), np.random.default_rng(0), 1000
     times = np.zeros((2, n, len(p)))
     for k in range(n):
-        items, often = _drawn(p, 4, rng)
+        items, often = draw_distinct(p, 4, rng)
         times[0, k, items] = often
         while (times[1, k] > 0).sum() < 4:
             times[1, k, rng.choice(len(p), p=p)] += 1
@@ -124,14 +122,14 @@ def test_costs_are_sums_over_pairs() -> None:
     norms = np.linalg.norm(x, axis=1)
     pairs = norms[:, None] * norms - x @ x.T
     expected = [pairs[:k, :k].sum() for k in range(1, 8)]
-    assert _costs_of_first(x, norms) == pytest.approx(expected, abs=1e-12)
+    assert costs_of_first(x, norms) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_cluster_is_cut_at_the_best_place() -> None:
     x = np.random.default_rng(0).random((12, 3))
     norms, members = np.linalg.norm(x, axis=1), np.arange(1, 12)
     pairs = norms[:, None] * norms - x @ x.T
-    left, right = _split(x, norms, members, np.random.default_rng(3))
+    left, right = split_cluster(x, norms, members, np.random.default_rng(3))
     assert sorted([*left, *right]) == list(members)
     line = np.random.default_rng(3).normal(size=3)
     order = members[np.argsort((x[members] / norms[members, None]) @ line)]

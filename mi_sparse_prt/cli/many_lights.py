@@ -1,0 +1,131 @@
+"""``mi-sparse-prt many-lights``: a scene lit by many lights, without precomputation."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mi_sparse_prt.cli import options
+from mi_sparse_prt.cli.running import running
+
+
+class ManyLightsMethod(StrEnum):
+    """Which form of the algorithm."""
+
+    adaptive = "adaptive"
+    hasan2007 = "hasan2007"
+
+
+Output = Annotated[
+    Path,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="Image to write: .exr (linear) or .png (sRGB).",
+        show_default=False,
+    ),
+]
+Rows = Annotated[
+    int, typer.Option(help="Samples that are lit by all lights: they tell which lights are alike.")
+]
+Columns = Annotated[int, typer.Option(help="Lights that light all samples, one for each cluster of lights.")]
+Seconds = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Choose --rows and --columns so that it takes so long.", show_default=False
+    ),
+]
+MethodOption = Annotated[
+    ManyLightsMethod, typer.Option(help="hasan2007 is the paper on matrix row-column sampling as published.")
+]
+Lights = Annotated[int, typer.Option(help="Lights in all, about.")]
+Samples = Annotated[int, typer.Option(help="Samples per pixel.")]
+MaxDepth = Annotated[
+    int, typer.Option(help="As for Mitsuba's path: 2 is direct light only, -1 has no limit.")
+]
+Clamp = Annotated[
+    float | None,
+    typer.Option(
+        help="Largest geometry term of indirect lights, 1 / (unit of the scene)^2.",
+        show_default="that of surfaces at 1/10 of the scene's radius",
+    ),
+]
+Camera = Annotated[int, typer.Option(help="Which of the scene's sensors.")]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same image.")]
+Preview = Annotated[
+    bool,
+    typer.Option(
+        "--preview", help="Write the image early, from a ninth of the columns, and again in the end."
+    ),
+]
+Exposure = Annotated[float, typer.Option(help="Stops by which .png files are brightened.")]
+
+
+def many_lights(
+    scene: options.SceneFile,
+    output: Output,
+    rows: Rows = 300,
+    columns: Columns = 900,
+    seconds: Seconds = None,
+    method: MethodOption = ManyLightsMethod.adaptive,
+    lights: Lights = 100_000,
+    spp: Samples = 4,
+    max_depth: MaxDepth = 5,
+    clamp: Clamp = None,
+    camera: Camera = 0,
+    seed: Seed = 0,
+    preview: Preview = False,
+    exposure: Exposure = 0.0,
+    define: options.Define = None,
+    variant: options.Variant = None,
+    json_file: options.JsonFile = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Render a scene under all its light as many point lights: a preview in seconds, nothing is precomputed.
+
+    Example: mi-sparse-prt many-lights scenes_xml/cornell.xml -o cornell.exr --rows 300 --columns 900
+
+    A forecast comes first, its own estimate of its error last. By time: --seconds 10 in place of --rows and --columns.
+    """
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise typer.BadParameter(f"{output}: give a name that ends in .exr or .png", param_hint="-o")
+    with running(json_file, quiet, outputs=[output]) as command:
+        from mi_sparse_prt.cli.files import image_bytes
+        from mi_sparse_prt.cli.tables.many_lights import many_lights_table
+        from mi_sparse_prt.manylights.elements import Floats
+        from mi_sparse_prt.manylights.render import render_many_lights
+        from mi_sparse_prt.scene.loading import load_mitsuba
+
+        def write(image: Floats) -> None:
+            command.write(output, image_bytes(image, output.suffix.lower(), exposure))
+
+        loaded = load_mitsuba(scene, **options.definitions(define))
+        with command.patient_interrupts() as let_interrupt:
+
+            def early(image: Floats) -> None:
+                write(image)
+                let_interrupt()
+
+            found = render_many_lights(
+                loaded,
+                rows,
+                columns,
+                seconds,
+                sensor=camera,
+                progress=not quiet,
+                preview=early if preview else None,
+                method=method.value,
+                lights=lights,
+                spp=spp,
+                max_depth=max_depth,
+                clamp=clamp,
+                seed=seed,
+            )
+            let_interrupt()
+            write(found.image)
+        command.report = {"scene": str(scene), "image": str(output), **found.report}
+        command.show(many_lights_table(str(scene), found.report))

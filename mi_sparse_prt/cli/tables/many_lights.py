@@ -1,0 +1,78 @@
+"""What pictures by many lights took, and how good they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from mi_sparse_prt.cli.tables.layout import FACTS, byte_count, duration, new_table, percent
+
+
+def many_lights_table(scene: str, report: dict[str, Any]) -> Table:
+    """Of a report of ``render_many_lights``."""
+    height, width = report["parameters"]["image"]
+    lights, error = report["lights"], report["estimated_error"]
+    emitters = [
+        (f"lights of {name}", f"{own['direct']:,} direct, {own['indirect']:,} reflected")
+        for name, own in lights["emitters"].items()
+    ]
+    facts = [
+        ("samples", f"{report['samples']:,} on surfaces, of {width} x {height} pixels"),
+        ("rows, columns", f"{report['rows']:,} and {report['columns']:,}"),
+        ("elements", f"{report['elements_evaluated']:,} of {report['elements_total']:,}"),
+        ("estimated error", "not known" if error is None else percent(error)),
+    ]
+    steps = [(phase, duration(taken)) for phase, taken in report["seconds"].items()]
+    memory = [("peak memory", byte_count(report["peak_memory_bytes"]))]
+    title = f"{scene}: {report['parameters']['method']}, {lights['total']:,} lights"
+    return new_table(title, FACTS, facts, emitters, steps, memory)
+
+
+def many_lights_tables(report: dict[str, Any]) -> list[Table]:
+    """What ``measure_many_lights`` found: time against error, and a table as [HPB07] has it."""
+    size, machine, whole = report["scene"], report["machine"], report["all_lights"]["seconds"]
+    title = (
+        f"{size['path']}: {size['samples']:,} samples, {size['lights']:,} lights; all of them take {duration(whole)}\n"
+        f"load average {machine['load_average']:.1f} (over {machine['cores']}: disturbed, times are too long)"
+    )
+    sections = [
+        [
+            (
+                name if k == 0 else "",
+                f"{p['rows']}/{p['columns']}" if "rows" in p else f"{p['lights']} lights",
+                duration(p["seconds"]),
+                percent(p["error"]),
+                percent(p["spread"]),
+                percent(p["predicted"]) if p.get("predicted") is not None else "",
+            )
+            for k, p in enumerate(points)
+        ]
+        for name, points in report["curves"].items()
+    ]
+    sections.append(
+        [
+            ("path" if k == 0 else "", f"{p['spp']} spp", duration(p["seconds"]), percent(p["error"]), "", "")
+            for k, p in enumerate(report["path"])
+        ]
+    )
+    columns = ("", "rows/columns", "time", "error", "over seeds", "predicted")
+    return [new_table(title, columns, *sections), _phases(report)]
+
+
+def _phases(report: dict[str, Any]) -> Table:
+    names = ("rows", "clustering", "columns")
+    rows = [
+        (
+            f"{row['method']} {row['rows']}/{row['columns']}",
+            duration(row["seconds"]["total"]),
+            *(duration(row["seconds"][name]) for name in names),
+            f"{report['all_lights']['seconds'] / row['seconds']['total']:.0f} x",
+            percent(row["error"]),
+            f"{row['flip']:.3f}",
+            byte_count(row["peak_memory_bytes"]),
+        )
+        for row in report["table"]
+    ]
+    columns = ("", "total", *names, "all lights", "error", "FLIP", "memory")
+    return new_table("By phase; occlusion rays in place of shadow maps", columns, rows)

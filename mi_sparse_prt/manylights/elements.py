@@ -1,0 +1,330 @@
+"""The matrix of samples and lights, whose elements are computed when they are asked for ([HPB07] 3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.manylights.light_arrays import DIRECTION, LightArrays, arriving
+from mi_sparse_prt.manylights.lights import Lights
+from mi_sparse_prt.manylights.samples import Receivers, Samples
+from mi_sparse_prt.manylights.surfaces import Surfaces
+from mi_sparse_prt.solvers.direct_rays import pass_straight
+
+LANES = 1 << 23  # elements of a kernel: about a fifth of a second
+ROWS = 16  # whose projections are added up at a time: sums are the same however many rows a kernel has
+
+Floats = NDArray[np.float32]
+Ids = NDArray[np.integer]
+Done = Callable[[int], object]  # is told how many rows or columns more are done
+
+
+class ReducedColumns(NamedTuple):
+    """Columns of some rows ([HPB07] 3.2), one for each light.
+
+    Attributes
+    ----------
+    projected : (n, r') float32
+        2-norms of RGB, projected.
+    norms : (n,) float64
+        Of the columns before that.
+    channel_norms : (n, 3) float64
+        Of each channel.
+    """
+
+    projected: Floats
+    norms: NDArray[np.float64]
+    channel_norms: NDArray[np.float64]
+
+
+class Elements:
+    """A[i, j]: the radiance that sample i reflects of light j towards the camera, linear RGB.
+
+    Occlusion rays decide whether there is any, so there is no bias of shadow maps. Light passes masks, thin panes and
+    ``null`` surfaces, each of which counts as a bounce.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    surfaces : Surfaces
+        Of the scene.
+    samples : Samples
+    lights : Lights
+    """
+
+    def __init__(self, scene: mi.Scene, surfaces: Surfaces, samples: Samples, lights: Lights) -> None:
+        self.scene, self.surfaces, self.samples, self.lights = scene, surfaces, samples, lights
+        depth = samples.max_depth
+        self._max_depth = depth if depth >= 0 else 1 << 30
+        self.evaluated = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Samples and lights."""
+        return len(self.samples), len(self.lights)
+
+    def block(self, rows: Ids, columns: Ids) -> Floats:
+        """Elements (len(rows), len(columns), 3).
+
+        Raises
+        ------
+        PrtError
+            One is not finite.
+        """
+        found = np.zeros((len(rows), len(columns), 3), np.float32)
+        step = max(1, LANES // max(len(columns), 1))
+        for a in range(0, len(rows) if len(columns) else 0, step):
+            part = np.asarray(rows[a : a + step], np.uint32)
+            i = mi.UInt32(np.repeat(part, len(columns)))
+            j = mi.UInt32(np.tile(np.asarray(columns, np.uint32), len(part)))
+            value = self.element(self.samples.receivers(i), self.lights.arrays.take(j), mi.Mask(True))
+            found[a : a + step] = value.numpy().T.reshape(len(part), len(columns), 3)
+        self.evaluated += found[..., 0].size
+        self._check(found.reshape(-1, 3), np.repeat(rows, len(columns)), np.tile(columns, len(rows)))
+        return found
+
+    def rows(self, ids: Ids) -> Floats:
+        """Whole rows (len(ids), n, 3)."""
+        return self.block(ids, np.arange(self.shape[1]))
+
+    def columns(self, ids: Ids) -> Floats:
+        """Whole columns (m, len(ids), 3)."""
+        return self.block(np.arange(self.shape[0]), ids)
+
+    def sum_columns(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Floats:
+        """Sums (m, 3) of columns, each times its colour, without keeping any.
+
+        Parameters
+        ----------
+        ids : (k,) integers
+        weights : (k, 3) float32
+        done : callable
+
+        Raises
+        ------
+        PrtError
+            An element is not finite: sample and light are named.
+        """
+        m, total = len(self.samples), dr.zeros(mi.Color3f, len(self.samples))
+        if not m or not len(ids):
+            return np.zeros((m, 3), np.float32)
+        column, factor, lane = (
+            mi.UInt32(np.asarray(ids, np.uint32)),
+            _colours(weights),
+            dr.arange(mi.UInt32, m),
+        )
+        for first, count in _pieces(len(ids), max(1, LANES // m)):
+            total = self._accumulated(total, lane, column, factor, first, count)
+            dr.eval(total)
+            done(count)
+        self.evaluated += m * len(ids)
+        found = np.ascontiguousarray(total.numpy().T)
+        self._check_sum(found, ids)
+        return found
+
+    def sum_of_rows(self, first: int, count: int) -> Floats:
+        """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
+        n = len(self.lights)
+        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        column, factor = dr.arange(mi.UInt32, n), dr.full(mi.Color3f, 1, n)
+        found = np.zeros((count, 3))
+        for start, size in _pieces(n, max(1, LANES // max(count, 1))):
+            part = self._accumulated(dr.zeros(mi.Color3f, count), lane, column, factor, start, size)
+            found += part.numpy().T
+        self.evaluated += n * count
+        self._check_sum(found.astype(np.float32), np.arange(n), first)
+        return found.astype(np.float32)
+
+    def each_column(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Iterator[Floats]:
+        """The columns (m, 3) that ``sum_columns`` adds up, one after the other."""
+        m = len(self.samples)
+        column, factor = mi.UInt32(np.asarray(ids, np.uint32)), _colours(weights)
+        for first, count in _pieces(len(ids), max(1, LANES // max(m, 1))):
+            found = self._kept(column, factor, first, count).numpy().reshape(3, count, m)
+            self.evaluated += m * count
+            done(count)
+            for k in range(count):
+                values = np.ascontiguousarray(found[:, k].T)
+                self._check_sum(values, ids)
+                yield values
+
+    def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
+        """All columns at some rows, projected as soon as they are known ([HPB07] 4).
+
+        Parameters
+        ----------
+        rows : (r,) integers
+        projection : (r, r') float32
+        done : callable
+
+        Raises
+        ------
+        PrtError
+            An element is not finite: sample and light are named.
+        """
+        n = len(self.lights)
+        projected = np.zeros((n, projection.shape[1]), np.float32)
+        squares = [dr.zeros(mi.Float, n) for _ in range(3)]
+        if n and len(rows):
+            receivers = self.samples.receivers(mi.UInt32(np.asarray(rows, np.uint32)))
+            dr.eval(receivers)
+        step = max(1, LANES // max(n, 1) // ROWS) * ROWS
+        for a in range(0, len(rows) if n else 0, step):
+            count = min(step, len(rows) - a)
+            norms, squares = self._norms(receivers, a, count, squares)
+            block = norms.numpy().reshape(count, n)
+            self._check_rows(block, np.asarray(rows)[a : a + count])
+            for b in range(0, count, ROWS):
+                own = slice(b, min(b + ROWS, count))
+                projected += block[own].T @ projection[a + own.start : a + own.stop]
+            done(count)
+        self.evaluated += n * len(rows)
+        channels = np.stack([square.numpy() for square in squares], axis=1).astype(np.float64)
+        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels))
+
+    def element(self, at: Receivers, light: LightArrays, active: mi.Mask) -> mi.Color3f:
+        """Radiance of one light at one sample in each lane."""
+        value, direction, active = self.unshadowed(at, light, active)
+        return self.shadowed(at, light, value, direction, active)
+
+    def unshadowed(
+        self, at: Receivers, light: LightArrays, active: mi.Mask
+    ) -> tuple[mi.Color3f, mi.Vector3f, mi.Mask]:
+        """As if nothing was between; the direction towards the light, and in which lanes there is any.
+
+        The geometry term of indirect lights is at most ``lights.clamp``, times what either BSDF has more than a white
+        diffuse one.
+        """
+        active = active & (light.depth + at.depth <= dr.opaque(mi.UInt32, self._max_depth))
+        found = arriving(light, at.si.p, self.lights.kinds, active)
+        out = at.si.to_local(found.direction)
+        cosine = mi.Frame3f.cos_theta(out)
+        above = cosine * mi.Frame3f.cos_theta(at.si.wi) > 0
+        value, largest = dr.select(at.diffuse & above, dr.abs(cosine), 0) * at.weight, dr.abs(cosine)
+        if not self.surfaces.all_lambertian:
+            own = active & ~at.diffuse & ~dr.all(found.irradiance == 0)
+            bsdf = at.si.bsdf().eval(mi.BSDFContext(), at.si, out, own)
+            value = dr.select(at.diffuse, value, bsdf * at.weight)
+            largest = dr.maximum(largest, dr.select(own, dr.pi * dr.max(bsdf), 0))
+        near, clamp = largest * found.cosine, dr.opaque(mi.Float, min(self.lights.clamp, 1e30))
+        scale = dr.select((light.depth > 2) & (near > clamp), clamp / near, 1)
+        value *= found.irradiance * scale
+        return value, found.direction, active & ~dr.all(value == 0)  # NaN is lit, so that it is noticed
+
+    def shadowed(
+        self,
+        at: Receivers,
+        light: LightArrays,
+        value: mi.Color3f,
+        direction: mi.Vector3f,
+        active: mi.Mask,
+    ) -> mi.Color3f:
+        """What of a light's radiance nothing is in the way of."""
+
+        def towards(si: mi.SurfaceInteraction3f) -> mi.Ray3f:
+            ray, near = si.spawn_ray(direction), si.spawn_ray_to(light.place)
+            far = light.kind == DIRECTION
+            return mi.Ray3f(
+                ray.o,
+                dr.select(far, ray.d, near.d),
+                dr.select(far, ray.maxt, near.maxt),
+                ray.time,
+                ray.wavelengths,
+            )
+
+        if not self.surfaces.passes_straight:
+            return dr.select(active & ~self.scene.ray_test(towards(at.si), active), value, 0)
+        most = dr.opaque(mi.UInt32, self._max_depth) - light.depth - at.depth
+        share, _, _ = pass_straight(self.scene, towards(at.si), active, most, towards, lambda c: c)
+        return dr.select(active, value * share, 0)
+
+    @dr.syntax
+    def _accumulated(
+        self,
+        total: mi.Color3f,
+        samples: mi.UInt32,
+        columns: mi.UInt32,
+        weights: mi.Color3f,
+        first: mi.UInt32,
+        count: int,
+    ) -> mi.Color3f:
+        """A lane for each sample; the lights are a loop inside of the kernel."""
+        at = self.samples.receivers(samples)
+        total, k, last = mi.Color3f(total), mi.UInt32(first), first + dr.opaque(mi.UInt32, count)
+        while k < last:
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, columns, k))
+            total += dr.gather(mi.Color3f, weights, k) * self.element(at, light, mi.Mask(True))
+            k += 1
+        return total
+
+    @dr.syntax
+    def _kept(self, columns: mi.UInt32, weights: mi.Color3f, first: mi.UInt32, count: int) -> mi.Color3f:
+        """The same, each light's values after those of the one before: (count * m)."""
+        m = len(self.samples)
+        lane = dr.arange(mi.UInt32, m)
+        at = self.samples.receivers(lane)
+        found = dr.zeros(mi.Color3f, m * count)
+        k, last = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, count)
+        while k < last:
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, columns, first + k))
+            factor = dr.gather(mi.Color3f, weights, first + k)
+            dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * m + lane)
+            k += 1
+        dr.eval(found)
+        return found
+
+    @dr.syntax
+    def _norms(
+        self, receivers: Receivers, first: int, count: int, squares: list[mi.Float]
+    ) -> tuple[mi.Float, list[mi.Float]]:
+        """A lane for each light, some samples one after the other: norms (count * n), and squares added to (n,)."""
+        n = len(self.lights)
+        lane = dr.arange(mi.UInt32, n)
+        light = self.lights.arrays.take(lane)
+        norms = dr.zeros(mi.Float, n * count)
+        x, y, z = (mi.Float(square) for square in squares)
+        k, row = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, first)
+        last = dr.opaque(mi.UInt32, count)
+        while k < last:
+            value = self.element(receivers.take(row + k), light, mi.Mask(True))
+            dr.scatter(norms, dr.norm(value), k * n + lane)
+            x += dr.square(value.x)
+            y += dr.square(value.y)
+            z += dr.square(value.z)
+            k += 1
+        dr.eval(norms, x, y, z)
+        return norms, [x, y, z]
+
+    def _check_sum(self, found: Floats, columns: Ids, first: int = 0) -> None:
+        bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+        if len(bad):
+            self.block(bad[:1] + first, columns)  # names it
+
+    def _check_rows(self, norms: Floats, rows: Ids) -> None:
+        bad = np.flatnonzero(~np.isfinite(norms).all(axis=1))
+        if len(bad):
+            self.block(rows[bad[:1]], np.flatnonzero(~np.isfinite(norms[bad[0]])))
+
+    def _check(self, values: Floats, rows: Ids, columns: Ids) -> None:
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(bad):
+            i, j = int(rows[bad[0]]), int(columns[bad[0]])
+            raise PrtError(
+                f"{self.samples.name(i)} reflects light that is not finite of {self.lights.name(j)}: repair its BSDF"
+            )
+
+
+def _pieces(count: int, size: int) -> Iterator[tuple[mi.UInt32, int]]:
+    """First numbers and lengths of pieces; kernels are the same for all."""
+    for first in range(0, count, size):
+        yield dr.opaque(mi.UInt32, first), min(size, count - first)
+
+
+def _colours(values: Floats) -> mi.Color3f:
+    return mi.Color3f(np.ascontiguousarray(np.asarray(values, np.float32).T))

@@ -1,0 +1,207 @@
+"""The sum of all columns from a column of each cluster, and how far off that is ([HPB07] 3.3, 4, Appendix A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedColumns
+from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_cost, with_lengths
+
+DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
+UNSEEN = 0.1  # of the clusters, at most, are for columns that no row sees
+SECOND = 0.1  # of the clusters have a second representative, which tells the error
+
+Ids = NDArray[np.int64]
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Clusters of columns.
+
+    Attributes
+    ----------
+    clusters : list of (size,) int64
+        Lights of each; no light is in two.
+    drawing : (n,) float64
+        In proportion to which a light represents its cluster, above 0 for lights in clusters.
+    costs : (c,) float64
+        Of each cluster, as rows see it.
+    """
+
+    clusters: list[Ids]
+    drawing: Doubles
+    costs: Doubles
+
+    def __len__(self) -> int:
+        return len(self.clusters)
+
+
+class Representatives(NamedTuple):
+    """A column of each cluster: (c,) int64, and what it is multiplied with: (c, 3) float32."""
+
+    ids: Ids
+    weights: Floats
+
+
+class Estimate(NamedTuple):
+    """The sum of all columns.
+
+    Attributes
+    ----------
+    values : (m, 3) float32
+        Radiance of samples.
+    squared_error : float
+        Expected, over pixels and channels, where a pixel is the mean of its samples; NaN where it was not estimated.
+    """
+
+    values: Floats
+    squared_error: float
+
+
+def published_partition(reduced: ReducedColumns, count: int, rng: np.random.Generator) -> Partition:
+    """As [HPB07] has it: columns that no row sees are ignored, representatives are drawn by their reduced norms.
+
+    Parameters
+    ----------
+    reduced : ReducedColumns
+    count : int
+        Clusters.
+    rng : np.random.Generator
+    """
+    return _partition(reduced, np.flatnonzero(reduced.norms > 0), reduced.norms, count, rng)
+
+
+def defensive_partition(
+    reduced: ReducedColumns, flux: Doubles, count: int, rng: np.random.Generator
+) -> Partition:
+    """All columns in clusters: no norm counts as less than a share of the mean one, so that no weight is huge.
+
+    Columns that no row sees have clusters of their own, of neighbours, and are drawn by their flux.
+
+    Parameters
+    ----------
+    reduced : ReducedColumns
+    flux : (n,) float64
+        Of the lights, none of them 0.
+    count : int
+        Clusters; one more where that is 1, and rows see some columns but not all.
+    rng : np.random.Generator
+    """
+    seen = reduced.norms > 0
+    lit, unseen = np.flatnonzero(seen), np.flatnonzero(~seen)
+    dark = min(len(unseen), count)
+    if len(lit) and len(unseen):
+        share = flux[unseen].sum() / flux.sum()
+        dark = min(dark, max(1, round(UNSEEN * count * share)))
+    drawing = reduced.norms + (DEFENSIVE * reduced.norms[lit].mean() if len(lit) else 0)
+    found = _partition(reduced, lit, drawing, max(count - dark, 1 if len(lit) else 0), rng)
+    if not dark:
+        return found
+    drawing[unseen] = flux[unseen]
+    middle = np.cumsum(flux[unseen]) - flux[unseen] / 2
+    piece = np.minimum((middle / flux[unseen].sum() * dark).astype(np.int64), dark - 1)
+    others = [unseen[piece == k] for k in range(dark) if (piece == k).any()]
+    return Partition([*found.clusters, *others], drawing, np.append(found.costs, np.zeros(len(others))))
+
+
+def _partition(
+    reduced: ReducedColumns, ids: Ids, drawing: Doubles, count: int, rng: np.random.Generator
+) -> Partition:
+    norms = reduced.norms[ids]
+    x = with_lengths(reduced.projected[ids], norms)
+    clusters = cluster_columns(x, norms, count, rng)
+    costs = np.array([max(cluster_cost(x[own], norms[own]), 0) for own in clusters])
+    return Partition([ids[own] for own in clusters], drawing, costs)
+
+
+def draw_representatives(partition: Partition, rng: np.random.Generator) -> Representatives:
+    """A light of each cluster, drawn in proportion to its weight w, times sum(w) / w: unbiased ([HPB07] 3.3)."""
+    ids, scale = _drawn(partition, rng)
+    return Representatives(ids, np.repeat(scale[:, None], 3, axis=1).astype(np.float32))
+
+
+def draw_coloured_representatives(
+    partition: Partition, channel_norms: Doubles, rng: np.random.Generator
+) -> Representatives:
+    """The same, but that the representative is given the cluster's total colour ([HPB07] 4): biased.
+
+    Channels that a representative does not have keep the scale of the others.
+
+    Parameters
+    ----------
+    partition : Partition
+    channel_norms : (n, 3) float64
+        Norms of the reduced columns, by channel.
+    rng : np.random.Generator
+    """
+    ids, scale = _drawn(partition, rng)
+    total = np.array([channel_norms[own].sum(axis=0) for own in partition.clusters]).reshape(-1, 3)
+    own = channel_norms[ids]
+    weights = np.divide(total, own, out=np.repeat(scale[:, None], 3, axis=1), where=own > 0)
+    return Representatives(ids, weights.astype(np.float32))
+
+
+def _drawn(partition: Partition, rng: np.random.Generator) -> tuple[Ids, Doubles]:
+    ids, scale = np.zeros(len(partition), np.int64), np.zeros(len(partition))
+    for k, (own, u) in enumerate(zip(partition.clusters, rng.random(len(partition)), strict=True)):
+        weights = partition.drawing[own]
+        sums = np.cumsum(weights)
+        place = min(int(np.searchsorted(sums, u * sums[-1], side="right")), len(own) - 1)
+        ids[k], scale[k] = own[place], sums[-1] / weights[place]
+    return ids, scale
+
+
+def sum_with_error(
+    elements: Elements, partition: Partition, rng: np.random.Generator, done: Done = lambda _: None
+) -> Estimate:
+    """The sum of all columns by one representative of each cluster, two of some, which tell the expected error.
+
+    For independent X and X' alike, E|X - E X|^2 = E|X - X'|^2 / 2 ([HPB07] Appendix A): here of whole columns, as the
+    image shows them. Those clusters are drawn by cost and by energy, and count by the mean of their two.
+
+    Parameters
+    ----------
+    elements : Elements
+    partition : Partition
+    rng : np.random.Generator
+    done : callable
+        Is told how many columns more are done.
+    """
+    first, second = draw_representatives(partition, rng), draw_representatives(partition, rng)
+    chance = _chances(partition)
+    twice = np.flatnonzero(_systematic(chance, rng))
+    once = np.setdiff1d(np.arange(len(partition)), twice)
+    values = elements.sum_columns(first.ids[once], first.weights[once], done)
+    squared = 0.0
+    ids = np.stack([first.ids[twice], second.ids[twice]], axis=1).ravel()
+    weights = np.stack([first.weights[twice], second.weights[twice]], axis=1).reshape(-1, 3)
+    columns = elements.each_column(ids, weights, done)
+    for k, x, y in zip(twice, columns, columns, strict=False):
+        values += (x + y) / 2
+        variance = float(np.square(elements.samples.pixel_means(x - y), dtype=np.float64).sum()) / 2
+        squared += variance * (1 / chance[k] - 1 / 2)
+    return Estimate(values, squared if len(twice) else (0.0 if not chance.any() else float("nan")))
+
+
+def _chances(partition: Partition) -> Doubles:
+    """Of each cluster to have a second representative; 0 where there is but one light."""
+    several = np.array([len(own) > 1 for own in partition.clusters], bool)
+    energy = np.array([partition.drawing[own].sum() for own in partition.clusters]) ** 2 * several
+    cost = partition.costs * several
+    size = np.sqrt(cost / max(cost.sum(), 1e-300)) + np.sqrt(energy / max(energy.sum(), 1e-300))
+    wanted = min(max(SECOND * len(partition), 2), several.sum())
+    chance, total = np.zeros(len(partition)), size.sum()
+    if total > 0:
+        chance = np.minimum(size * (wanted / total), 1)
+    return chance
+
+
+def _systematic(chance: Doubles, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Items with these chances, about as many as their sum."""
+    edges = np.floor(np.cumsum(chance) + rng.random())
+    return np.diff(edges, prepend=0.0) > 0 if len(edges) else np.zeros(0, bool)

@@ -1,0 +1,338 @@
+"""A picture of a scene lit by many lights, without precomputation ([HPB07])."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.profiling import peak_memory, reset_peak_memory, versions
+from mi_sparse_prt.core.random_keys import random_stream
+from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.core.variant import check_variant
+from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
+from mi_sparse_prt.manylights.estimate import (
+    SECOND,
+    Estimate,
+    Partition,
+    defensive_partition,
+    draw_coloured_representatives,
+    published_partition,
+    sum_with_error,
+)
+from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
+from mi_sparse_prt.manylights.samples import Samples
+from mi_sparse_prt.manylights.surfaces import Surfaces
+from mi_sparse_prt.sampling.row_column import random_projection
+from mi_sparse_prt.scene.loading import load_mitsuba
+from mi_sparse_prt.scene.scene import Scene
+
+METHODS = "hasan2007", "adaptive"
+PROJECTED = 50  # dimensions of reduced columns ([HPB07] 4: r')
+COLUMNS_PER_ROW = 3  # within a time budget
+FEWEST = 16, 48  # rows and columns
+_PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
+
+PILOT = 16  # rows, and columns, that tell what others cost
+CLUSTERING = 7e-9  # seconds for each light and cluster
+EARLY = 9  # times fewer columns for a preview
+RESERVE = 0.05  # of a time budget
+
+View = tuple[mi.Scene, mi.Sensor]
+
+
+class Costs(NamedTuple):
+    """Seconds of a row, of a column, and of clustering for each column."""
+
+    row: float
+    column: float
+    clustering: float
+
+
+@dataclass(frozen=True)
+class ManyLightsImage:
+    """A picture, and how it came about.
+
+    Attributes
+    ----------
+    image : (height, width, 3) float32
+        Linear RGB, of the film's crop window.
+    alpha : (height, width) float32
+        Share of each pixel that is covered by what the scene shows.
+    report : dict
+        ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
+        ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known),
+        ``clamp``, ``peak_memory_bytes``, ``parameters``, ``seed``, ``versions``. JSON as it is.
+    """
+
+    image: Floats
+    alpha: NDArray[np.float32]
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What ``render_many_lights`` is asked for; see there.
+
+    Raises
+    ------
+    PrtError
+        A number is too small, or the method is unknown.
+    """
+
+    rows: int = 300
+    columns: int = 900
+    seconds: float | None = None
+    method: str = "adaptive"
+    spp: int = 4
+    lights: int = 100_000
+    max_depth: int = 5
+    clamp: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise PrtError(f"method {self.method!r} is unknown: choose from {', '.join(METHODS)}")
+        for name in ("rows", "columns"):
+            if getattr(self, name) < 1:
+                raise PrtError(f"{name} is {getattr(self, name)}: give 1 or more")
+        if self.seconds is not None and not self.seconds > 0:
+            raise PrtError(f"seconds is {self.seconds}: give a number above 0")
+        self.light_options()
+
+    def light_options(self) -> LightOptions:
+        """Those of the lights."""
+        return LightOptions(self.lights, max_depth=self.max_depth, clamp=self.clamp, seed=self.seed)
+
+    def random(self, purpose: int) -> np.random.Generator:
+        """Random numbers for one purpose."""
+        return np.random.default_rng(random_stream(self.seed, purpose))
+
+
+def render_many_lights(
+    scene: mi.Scene | Scene | str | Path,
+    rows: int = 300,
+    columns: int = 900,
+    seconds: float | None = None,
+    sensor: int | mi.Sensor = 0,
+    progress: bool = False,
+    preview: Callable[[Floats], object] | None = None,
+    **settings: Any,
+) -> ManyLightsImage:
+    """Render a scene by matrix row-column sampling: all its light as many point lights, few of which are evaluated.
+
+    Some rows of the matrix of samples and lights tell which columns are alike, one column stands for each cluster of
+    these. There is no precomputation; whatever changes, the next picture is a new one.
+
+    Parameters
+    ----------
+    scene : mi.Scene, Scene, str or Path
+        Of any shapes that Mitsuba can intersect, instances and curves too; world units. A path is that of an XML file.
+    rows, columns : int
+        That are evaluated ([HPB07] recommends two or three columns for each row).
+    seconds : float, optional
+        Choose rows and columns by what they cost, to be done by then; compilation is not counted.
+    sensor : int or mi.Sensor
+    progress : bool
+        Show a forecast and progress bars.
+    preview : callable, optional
+        Is given an image (height, width, 3) early, from a ninth of the columns; the result is the same without.
+    **settings
+        ``method``: ``"adaptive"``, or ``"hasan2007"`` for the paper as published. ``spp``: samples per pixel (4).
+        ``lights``: about how many (100,000). ``max_depth``: as for ``path`` (5). ``clamp``: see ``LightOptions``.
+        ``seed`` (0).
+
+    Returns
+    -------
+    ManyLightsImage
+
+    Raises
+    ------
+    PrtError
+        A number that makes no sense; no such sensor; a light, a medium or a variant that is not supported; light that
+        is not finite, naming the shape.
+
+    Notes
+    -----
+    Hasan, Pellacini, Bala: Matrix Row-Column Sampling for the Many-Light Problem, SIGGRAPH 2007. Indirect light is that
+    of virtual point lights, whose geometry term is clamped: corners are a little too dark.
+    """
+    check_variant()
+    try:
+        asked = Settings(rows, columns, seconds, **settings)
+    except TypeError as error:
+        raise PrtError(f"render_many_lights: {error}") from None
+    reset_peak_memory()
+    run = Run(asked.seed, progress=progress)
+    with run.clock.phase("load"):
+        view = find_view(scene, sensor)
+    found = RowColumn(matrix_of(view, asked, run), asked, run)
+    estimate = found.estimate(preview)
+    return found.picture(estimate)
+
+
+def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> View:
+    """A scene, and one of its cameras.
+
+    Raises
+    ------
+    PrtError
+        There is no such file or camera.
+    """
+    if isinstance(scene, (str, Path)):
+        scene = load_mitsuba(scene)
+    if isinstance(scene, Scene):
+        scene = scene.mitsuba
+    if isinstance(sensor, int):
+        sensors = scene.sensors()
+        if not 0 <= sensor < len(sensors):
+            raise PrtError(
+                f"the scene has {len(sensors)} sensors, and no sensor {sensor}: add one, or give another"
+            )
+        sensor = sensors[sensor]
+    return scene, sensor
+
+
+def matrix_of(view: View, settings: Settings, run: Run) -> Elements:
+    """The matrix of a view; samples and lights are phases of the run's clock."""
+    scene, sensor = view
+    surfaces = Surfaces(scene)
+    with run.clock.phase("samples"):
+        samples = Samples(scene, surfaces, sensor, settings.spp, settings.max_depth, settings.seed)
+    with run.clock.phase("lights"):
+        lights = scene_lights(scene, settings.light_options())
+    return Elements(scene, surfaces, samples, lights)
+
+
+class RowColumn:
+    """Matrix row-column sampling of one matrix, step by step.
+
+    Parameters
+    ----------
+    elements : Elements
+    settings : Settings
+    run : Run
+        Its clock tells where time goes.
+    """
+
+    def __init__(self, elements: Elements, settings: Settings, run: Run) -> None:
+        self.elements, self.settings, self.run = elements, settings, run
+        self.samples, self.lights = elements.samples, elements.lights
+        self.rows, self.columns = settings.rows, settings.columns
+
+    def costs(self) -> Costs:
+        """What a row and a column take, from a few of them, and clustering for each column."""
+        clock = self.run.clock
+        with clock.phase("pilot"):
+            rows = self.samples.stratified_rows(PILOT, self.settings.seed)
+            columns = np.linspace(0, len(self.lights) - 1, PILOT).astype(np.int64)
+            weights, projection = np.ones((PILOT, 3), np.float32), np.eye(len(rows), dtype=np.float32)
+            took = []
+            for _ in range(2):  # kernels are compiled in the first round
+                start = time.perf_counter()
+                self.elements.reduce_columns(rows, projection)
+                middle = time.perf_counter()
+                self.elements.sum_columns(columns, weights)
+                took.append((middle - start, time.perf_counter() - middle))
+        row, column = (seconds / PILOT for seconds in took[-1])
+        return Costs(row, column * (1 + SECOND), CLUSTERING * len(self.lights))
+
+    def forecast(self, costs: Costs) -> float:
+        """Seconds that rows, clustering and columns will take."""
+        return self.rows * costs.row + self.columns * (costs.column + costs.clustering)
+
+    def _affordable(self, costs: Costs, seconds: float) -> tuple[int, int]:
+        """Rows and columns that fit into what is left of so many seconds."""
+        left = seconds - self.run.clock.report()["total"]
+        each = costs.row + COLUMNS_PER_ROW * (costs.column + costs.clustering)
+        rows = int(left / (each * (1 + RESERVE)))
+        rows, columns = max(rows, FEWEST[0]), max(COLUMNS_PER_ROW * rows, FEWEST[1])
+        return min(rows, len(self.samples)), min(columns, len(self.lights))
+
+    def reduced(self, rows: int) -> ReducedColumns:
+        """Reduced columns of so many rows."""
+        ids = self.samples.stratified_rows(rows, self.settings.seed)
+        projection = random_projection(len(ids), PROJECTED, self.settings.random(_PROJECT))
+        with self.run.clock.phase("rows"), self.run.bar(len(ids), "rows") as bar:
+            return self.elements.reduce_columns(ids, projection, bar.update)
+
+    def partition(self, reduced: ReducedColumns, columns: int) -> Partition:
+        """Clusters by the method."""
+        rng = self.settings.random(_CLUSTER)
+        with self.run.clock.phase("clustering"):
+            if self.settings.method == "hasan2007":
+                return published_partition(reduced, columns, rng)
+            return defensive_partition(reduced, self.lights.flux, columns, rng)
+
+    def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
+        """The sum of all columns by those that represent their clusters."""
+        rng = self.settings.random(_DRAW)
+        published = self.settings.method == "hasan2007"
+        total = len(partition) if published else round((1 + SECOND) * len(partition))
+        with self.run.clock.phase("columns"), self.run.bar(total, "columns", " columns") as bar:
+            if published:
+                chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
+                return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
+            return sum_with_error(self.elements, partition, rng, bar.update)
+
+    def estimate(self, preview: Callable[[Floats], object] | None = None) -> Estimate:
+        """All steps; within a time budget, rows and columns by what a few of them cost."""
+        if not len(self.samples) or not len(self.lights):
+            self.rows = self.columns = 0
+            return Estimate(np.zeros((len(self.samples), 3), np.float32), 0.0)
+        if self.settings.seconds is not None or self.run.progress:
+            costs = self.costs()
+            if self.settings.seconds is not None:
+                self.rows, self.columns = self._affordable(costs, self.settings.seconds)
+            self._announce(self.forecast(costs))
+        reduced = self.reduced(self.rows)
+        if preview is not None:
+            rough = self.partition(reduced, -(-self.columns // EARLY))
+            preview(self.samples.image(self.summed(reduced, rough).values))
+        partition = self.partition(reduced, self.columns)
+        self.rows, self.columns = min(self.rows, len(self.samples)), len(partition)
+        return self.summed(reduced, partition)
+
+    def _announce(self, seconds: float) -> None:
+        if self.run.progress:
+            m, n = self.elements.shape
+            print(
+                f"{m:,} samples, {n:,} lights: {self.rows} rows and {self.columns} columns, about {seconds:.2g} s",
+                file=sys.stderr,
+            )
+
+    def picture(self, estimate: Estimate) -> ManyLightsImage:
+        """The image, and the report of the run."""
+        with self.run.clock.phase("filter"):
+            image = self.samples.image(estimate.values)
+            covered = self.samples.covered.astype(np.float32)[:, None]
+            alpha = self.samples.filtered(covered)[..., 0]
+        return ManyLightsImage(image, alpha, self._report(image, estimate.squared_error))
+
+    def _report(self, image: Floats, squared_error: float) -> dict[str, Any]:
+        m, n = self.elements.shape
+        norm = float(np.square(image, dtype=np.float64).sum())
+        known = np.isfinite(squared_error)
+        return {
+            "seconds": self.run.clock.report(),
+            "rows": self.rows,
+            "columns": self.columns,
+            "samples": m,
+            "lights": {"total": n, "emitters": self.lights.counts()},
+            "elements_total": m * n,
+            "elements_evaluated": self.elements.evaluated,
+            "estimated_error": (float(np.sqrt(squared_error / norm)) if norm > 0 else 0.0) if known else None,
+            "clamp": self.lights.clamp if np.isfinite(self.lights.clamp) else None,
+            "peak_memory_bytes": peak_memory(),
+            "parameters": {**vars(self.settings), "image": list(self.samples.shape)},
+            "seed": self.settings.seed,
+            "versions": versions(),
+        }

@@ -1,0 +1,280 @@
+"""What a camera sees: places on surfaces whose light is asked for, and light that it sees without asking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.morton import morton_order
+from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.manylights.particles import next_2d
+from mi_sparse_prt.manylights.surfaces import Surfaces, diffuse_value
+from mi_sparse_prt.measurement.pixels import jittered_places
+from mi_sparse_prt.scene.instances import placed_shapes
+
+LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
+BENT = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+_CAMERA = 0x5A17  # key of random numbers
+
+Floats = NDArray[np.float32]
+
+
+@dataclass
+class Receivers:
+    """Places on surfaces that light arrives at, an array for each attribute (Dr.Jit).
+
+    Attributes
+    ----------
+    si : SurfaceInteraction3f
+    weight : Color3f
+        Share of the light that the camera sees by way of mirrors and glass; of diffuse surfaces times their BSDF.
+    diffuse : Mask
+    depth : UInt32
+        Mirrors, panes and holes on the way.
+    """
+
+    si: Any
+    weight: Any
+    diffuse: Any
+    depth: Any
+
+    def take(self, ids: mi.UInt32, active: mi.Mask = True) -> Receivers:
+        """Some of them."""
+        return dr.gather(Receivers, self, ids, active)
+
+
+class Samples:
+    """Samples of a film's pixels: the rows of the matrix.
+
+    Rays of the camera follow mirrors, glass and holes up to the first surface that also does something else; there the
+    sample is. Those that leave the scene, or end on the way, have no row.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    surfaces : Surfaces
+        Of the scene.
+    sensor : mi.Sensor
+        Its film has the size (crop window) and the reconstruction filter.
+    spp : int
+        Samples per pixel, stratified: 4 are 2 x 2.
+    max_depth : int
+        As for ``path``.
+    seed : int
+
+    Attributes
+    ----------
+    shape : tuple of int
+        (height, width) of the image.
+    ids : (m,) int64
+        Of all samples, pixel by pixel, those that have a row.
+    seen : (n_samples, 3) float32
+        Radiance that each sees without reflection, of lamps and of the environment.
+
+    Raises
+    ------
+    PrtError
+        If there is to be less than one sample per pixel.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, surfaces: Surfaces, sensor: mi.Sensor, spp: int, max_depth: int, seed: int
+    ) -> None:
+        film = sensor.film()
+        width, height = (int(n) for n in film.crop_size())
+        self.shape, self.spp, self.max_depth = (height, width), spp, max_depth
+        self._places, self._rfilter = jittered_places(width, height, spp, seed), film.rfilter()
+        self._scene = scene
+        ray, weight, rng = _camera_rays(sensor, self._places, seed)
+        limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
+        seen, ray, hit, weight, depth, found = _follow(scene, ray, weight, rng, limit)
+        dr.eval(seen, ray, hit, weight, depth, found)
+        self.seen: Floats = np.ascontiguousarray(seen.numpy().T)
+        self.covered = found.numpy() | (self.seen > 0).any(axis=1)
+        index = dr.compress(found)
+        self.ids = index.numpy().astype(np.int64)
+        if len(self.ids):
+            ray, hit, weight, depth = (dr.gather(type(x), x, index) for x in (ray, hit, weight, depth))
+            self._hit, self._ray, self._depth = hit, ray, depth
+            si = hit.compute_surface_interaction(ray)
+            self._diffuse = surfaces.lambertian(si)
+            self._weight = weight * dr.select(self._diffuse, diffuse_value(si, self._diffuse), 1)
+            dr.eval(self._hit, self._ray, self._depth, self._diffuse, self._weight)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def receivers(self, ids: mi.UInt32) -> Receivers:
+        """Samples on the device, by their rows."""
+        ray, hit = dr.gather(mi.Ray3f, self._ray, ids), dr.gather(type(self._hit), self._hit, ids)
+        return Receivers(
+            hit.compute_surface_interaction(ray),
+            dr.gather(mi.Color3f, self._weight, ids),
+            dr.gather(mi.Bool, self._diffuse, ids),
+            dr.gather(mi.UInt32, self._depth, ids),
+        )
+
+    def name(self, row: int) -> str:
+        """Where a sample is, for messages."""
+        y, x = divmod(int(self.ids[row]) // self.spp, self.shape[1])
+        met = dr.gather(mi.ShapePtr, self._hit.shape, mi.UInt32(row))
+        found = (w.name for w in placed_shapes(self._scene) if dr.all(met == mi.ShapePtr(w.shape)))
+        return f"shape '{next(found, 'of an instance')}' (pixel {x}, {y})"
+
+    def image(self, values: Floats) -> Floats:
+        """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
+        every = self.seen.copy()
+        every[self.ids] += values
+        return self.filtered(every)
+
+    def filtered(self, every: Floats) -> Floats:
+        """Pixels (height, width, channels) of values (n_samples, channels), by the reconstruction filter."""
+        height, width = self.shape
+        reach = int(np.ceil(self._rfilter.radius() - 0.5))
+        values = np.append(every, np.ones_like(every[:, :1]), axis=1)  # the last channel: sums of weights
+        values = values.reshape(height, width, self.spp, -1)
+        away = self._places.reshape(height, width, self.spp, 2) % 1 - np.float32(0.5)
+        # filters are separable: of each offset along an axis, what it weighs
+        x, y = ([self._rfilter_at(away[..., k], d) for d in range(-reach, reach + 1)] for k in range(2))
+        total = np.zeros((height + 2 * reach, width + 2 * reach, values.shape[-1]), np.float32)
+        for j, along_y in enumerate(y):
+            for i, along_x in enumerate(x):
+                weighted = np.einsum("yxs,yxsc->yxc", along_x * along_y, values)
+                total[j : j + height, i : i + width] += weighted
+        kept = total[reach : reach + height, reach : reach + width]
+        scale = np.divide(1, kept[..., -1:], out=np.zeros_like(kept[..., -1:]), where=kept[..., -1:] != 0)
+        return kept[..., :-1] * scale
+
+    def _rfilter_at(self, away: Floats, offset: int) -> Floats:
+        """The filter around the centre of another pixel of a row or column."""
+        at = mi.Float(np.ascontiguousarray(away - np.float32(offset)).ravel())
+        return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
+
+    def pixel_means(self, values: Floats) -> Floats:
+        """Means (pixels, 3) of what rows add to their pixels, (m, 3); of those pixels that have rows."""
+        sums: Floats = np.add.reduceat(values, self._first_rows, axis=0, dtype=np.float32)
+        return sums / np.float32(self.spp)
+
+    @cached_property
+    def _first_rows(self) -> NDArray[np.int64]:
+        """The first row of each pixel that has some."""
+        return np.unique(self.ids // self.spp, return_index=True)[1]
+
+    def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
+        """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.
+
+        Parameters
+        ----------
+        count : int
+        seed : int
+
+        Returns
+        -------
+        (min(count, m),) int64
+            Ascending along the curve.
+        """
+        y, x = np.divmod(self.ids // self.spp, self.shape[1])
+        place = np.stack([x, y, np.zeros_like(x)], axis=1)
+        order = morton_order(place, np.arange(len(self), dtype=np.uint64))
+        count = min(count, len(self))
+        u = np.random.default_rng([seed, _CAMERA]).random(count)
+        at = ((np.arange(count) + u) * (len(self) / max(count, 1))).astype(np.int64)
+        return order[np.minimum(at, len(self) - 1)]
+
+
+def _camera_rays(sensor: mi.Sensor, places: Floats, seed: int) -> tuple[mi.Ray3f, mi.Color3f, mi.PCG32]:
+    """A ray through each place (n, 2) of the crop window, in pixels; of the aperture and the shutter at random."""
+    n, crop = len(places), sensor.film().crop_size()
+    rng = random_generator(mi.UInt64(dr.arange(mi.UInt32, n)), mi.UInt32(_CAMERA), mi.UInt32(0), seed)
+    at = mi.Point2f(*(np.ascontiguousarray(places[:, k] / crop[k]) for k in range(2)))
+    time = sensor.shutter_open() + rng.next_float32() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray(time, rng.next_float32(), at, next_2d(rng))
+    return mi.Ray3f(ray), mi.Color3f(weight), rng
+
+
+@dr.syntax
+def _follow(
+    scene: mi.Scene, ray: mi.Ray3f, weight: mi.Color3f, rng: mi.PCG32, limit: mi.UInt32
+) -> tuple[mi.Color3f, mi.Ray3f, mi.PreliminaryIntersection3f, mi.Color3f, mi.UInt32, mi.Mask]:
+    """Follow rays to surfaces that are not only specular.
+
+    Returns
+    -------
+    seen : Color3f
+        Radiance of what they saw on the way.
+    ray, hit
+        The last ray of each, and where it ends.
+    weight : Color3f
+    depth : UInt32
+        Surfaces before that.
+    found : Mask
+        Whether there is such a surface.
+    """
+    ray, weight = mi.Ray3f(ray), mi.Color3f(weight)
+    seen, depth = mi.Color3f(0), mi.UInt32(0)
+    found, active = mi.Mask(False), limit > 0
+    kept_ray, kept_hit = mi.Ray3f(ray), dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
+    active &= dr.max(weight) > 0
+    while active:
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        si = hit.compute_surface_interaction(ray, active=active)
+        seen += dr.select(active, weight * si.emitter(scene, active).eval(si, active), 0)
+        active &= si.is_valid() & (depth + 1 < limit)
+        goes_on, out, factor = _specular(si, rng, active)
+        stays = active & ~goes_on
+        kept_ray = dr.select(stays, ray, kept_ray)
+        kept_hit = dr.select(stays, hit, kept_hit)
+        found |= stays
+        weight = dr.select(active, weight * factor, weight)
+        ray = si.spawn_ray(out)
+        active &= goes_on & (dr.max(weight) > 0)
+        depth += dr.select(active, 1, 0)
+    return seen, kept_ray, kept_hit, weight, depth, found & (dr.max(weight) > 0)
+
+
+def _specular(
+    si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
+) -> tuple[mi.Mask, mi.Vector3f, mi.Color3f]:
+    """Whether rays go on from surfaces, where to (world), and what either choice weighs.
+
+    Where there is nothing but mirrors and glass, they do, as Mitsuba's BSDF samples it. Otherwise they pass holes as
+    often as light does; and go on by other single directions as often as these reflect, about, which is known from a
+    sample of its own: the choice must not depend on the sample that is followed.
+    """
+    flags, bsdf = si.bsdf().flags(), si.bsdf()
+    bent = (flags & BENT) != 0
+    smooth, null = mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.has_flag(flags, mi.BSDFFlags.Null)
+    u, choice = rng.next_float32(), rng.next_float32()
+    whole, single = mi.BSDFContext(), mi.BSDFContext()
+    single.type_mask = BENT
+
+    # holes, beside what is around them
+    passed = mi.Color3f(bsdf.eval_null_transmission(si, active & smooth & null))
+    p_hole = dr.clip(dr.mean(passed), 0, 1)
+    hole = smooth & null & (u < p_hole)
+    factor = dr.select(hole, passed / dr.maximum(p_hole, 1e-6), 1)
+    factor = dr.select(smooth & null & ~hole, 1 / dr.maximum(1 - p_hole, 1e-6), factor)
+
+    # a coat, or something else that reflects into single directions, beside what spreads light
+    mixed = active & smooth & bent & ~hole
+    _, guess = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), mixed & ~null)
+    p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.2, 0.8))
+    follows = mixed & (choice < p_bent)
+    some, its = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), follows & ~null)
+    only = active & ~smooth
+    other, share = bsdf.sample(whole, si, rng.next_float32(), next_2d(rng), only | (follows & null))
+    is_bent = (mi.UInt32(other.sampled_type) & BENT) != 0
+    its = dr.select(null, dr.select(is_bent, share, 0), its)
+    factor = dr.select(follows, factor * its / p_bent, factor)
+    factor = dr.select(mixed & ~follows, factor / (1 - p_bent), factor)
+    factor = dr.select(only, share, factor)
+
+    out = dr.select(only | null, si.to_world(other.wo), si.to_world(some.wo))
+    out = dr.select(hole, si.to_world(-si.wi), out)
+    return active & (only | hole | follows), out, factor

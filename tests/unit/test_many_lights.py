@@ -1,0 +1,444 @@
+"""Many lights: lights of a scene, samples, elements, estimates; small, and where possible against brute force."""
+
+import json
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import diffuse
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.manylights import elements as elements_module
+from mi_sparse_prt.manylights.baselines import all_lights, draw_by_power, instant_radiosity
+from mi_sparse_prt.manylights.elements import Elements, ReducedColumns
+from mi_sparse_prt.manylights.estimate import (
+    Partition,
+    defensive_partition,
+    draw_coloured_representatives,
+    draw_representatives,
+    published_partition,
+    sum_with_error,
+)
+from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
+from mi_sparse_prt.manylights.samples import Samples
+from mi_sparse_prt.manylights.surfaces import Surfaces
+
+T = mi.ScalarTransform4f
+FLOOR = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": diffuse(0.6, 0.5, 0.4)}
+LAMP = {
+    "type": "rectangle",
+    "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.5),
+    "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [6, 5, 4]}},
+}
+SMALL = {"rows": 12, "columns": 20, "lights": 300, "max_depth": 3}
+
+
+def camera(size: int = 16, **film: object) -> dict:
+    return {
+        "type": "perspective",
+        "fov": 50,
+        "to_world": T().look_at([0, 1, 3.2], [0, 0.8, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, **film},
+    }
+
+
+def room(size: int = 16, **more: object) -> mi.Scene:
+    ball = {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": diffuse(0.7, 0.6, 0.2)}
+    shapes = {"floor": FLOOR, "ball": ball, "lamp": LAMP} | more
+    kept = {name: thing for name, thing in shapes.items() if thing is not None}
+    return mi.load_dict({"type": "scene", "sensor": camera(size), **kept})
+
+
+def matrix_of(scene: mi.Scene, count: int = 300, max_depth: int = 3, spp: int = 4, seed: int = 0) -> Elements:
+    surfaces = Surfaces(scene)
+    samples = Samples(scene, surfaces, scene.sensors()[0], spp, max_depth, seed)
+    lights = scene_lights(scene, LightOptions(count, max_depth=max_depth, seed=seed))
+    return Elements(scene, surfaces, samples, lights)
+
+
+@pytest.fixture(scope="module")
+def small_room() -> mi.Scene:
+    return room()
+
+
+@pytest.fixture(scope="module")
+def matrix(small_room: mi.Scene) -> Elements:
+    return matrix_of(small_room)
+
+
+@pytest.fixture(scope="module")
+def whole(matrix: Elements) -> np.ndarray:
+    return matrix.rows(np.arange(matrix.shape[0])).astype(np.float64)  # [sample, light, rgb]
+
+
+def reduced_from(whole: np.ndarray, rows: np.ndarray) -> ReducedColumns:
+    own = whole[rows]
+    norms = np.linalg.norm(own, axis=(0, 2))
+    return ReducedColumns(
+        np.linalg.norm(own, axis=2).T.astype(np.float32), norms, np.linalg.norm(own, axis=0)
+    )
+
+
+# -- elements ---------------------------------------------------------------------------------------------------------
+
+
+def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whole: np.ndarray) -> None:
+    rows, columns = np.array([5, 0, 77]), np.array([3, 250, 17, 4])
+    assert np.array_equal(matrix.block(rows, columns), whole[np.ix_(rows, columns)])
+    assert np.array_equal(matrix.columns(columns), whole[:, columns])
+    weights = np.random.default_rng(0).random((4, 3)).astype(np.float32)
+    expected = np.einsum("ijc,jc->ic", whole[:, columns], weights)
+    assert matrix.sum_columns(columns, weights) == pytest.approx(expected, rel=1e-5, abs=1e-7)
+    for each, column, weight in zip(matrix.each_column(columns, weights), columns, weights, strict=True):
+        assert each == pytest.approx(whole[:, column] * weight, rel=1e-5, abs=1e-7)
+    assert matrix.sum_of_rows(10, 30) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
+
+
+def test_reduced_columns_are_norms_of_colours_projected(matrix: Elements, whole: np.ndarray) -> None:
+    rows = matrix.samples.stratified_rows(40, 0)
+    projection = np.random.default_rng(0).normal(size=(40, 5)).astype(np.float32)
+    found, expected = matrix.reduce_columns(rows, projection), reduced_from(whole, rows)
+    assert found.projected == pytest.approx(expected.projected @ projection, rel=1e-4, abs=1e-5)
+    assert found.norms == pytest.approx(expected.norms, rel=1e-5)
+    assert found.channel_norms == pytest.approx(expected.channel_norms, rel=1e-5)
+
+
+@pytest.mark.parametrize("method", ["adaptive", "hasan2007"])
+def test_the_image_is_the_same_in_any_block_size(small_room: mi.Scene, method: str, monkeypatch) -> None:
+    images = []
+    for lanes in (1 << 23, 5000, 20000):
+        monkeypatch.setattr(elements_module, "LANES", lanes)
+        images.append(prt.render_many_lights(small_room, method=method, seed=3, **SMALL).image)
+    assert np.array_equal(images[0], images[1]) and np.array_equal(images[0], images[2])
+    other = prt.render_many_lights(small_room, method=method, seed=4, **SMALL).image
+    assert not np.array_equal(images[0], other)
+
+
+def test_stratified_rows_lie_in_blocks_of_the_image(matrix: Elements) -> None:
+    rows = matrix.samples.stratified_rows(30, 5)
+    assert len(set(rows)) == 30
+    pixel = matrix.samples.ids[rows] // matrix.samples.spp
+    assert (
+        len(np.unique(np.stack(np.divmod(pixel, 16)) // 4, axis=1).T) >= 10
+    )  # of 16 blocks, some without rows
+    every = matrix.samples.stratified_rows(10**6, 5)
+    assert sorted(every) == list(range(len(matrix.samples)))
+
+
+# -- estimates --------------------------------------------------------------------------------------------------------
+
+
+def estimates(whole: np.ndarray, draw, count: int) -> np.ndarray:
+    """Means over samples (count, 3) of estimates of all columns."""
+    columns = whole.mean(axis=0)  # [light, rgb]
+    found = np.zeros((count, 3))
+    for k in range(count):
+        chosen = draw(k)
+        found[k] = (columns[chosen.ids] * chosen.weights).sum(axis=0)
+    return found
+
+
+def deviation(found: np.ndarray, whole: np.ndarray) -> tuple[float, float]:
+    """Relative deviation of the mean of estimates, and its standard error; of the sum of the channels."""
+    truth = whole.mean(axis=0).sum()
+    sums = found.sum(axis=1)
+    return sums.mean() / truth - 1, sums.std() / np.sqrt(len(sums)) / truth
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_the_mean_of_estimates_is_the_sum_of_all_columns(whole: np.ndarray, fixed: bool) -> None:
+    """The defensive estimate is unbiased, with the same rows and with new ones.
+
+    Rationale: six rows see only a part of the lights; representatives that were drawn without the others, or scaled by
+    other weights than they were drawn by, would give a mean that is off by what those columns hold.
+    Expected: within four standard errors of 1000 estimates, and these small enough to see a bias of 1%; some columns
+    are seen by no row.
+    """
+    rng, flux = np.random.default_rng(0), np.ones(whole.shape[1])
+    partitions: list[Partition] = []
+
+    def draw(k: int):
+        if not fixed or not partitions:
+            rows = rng.choice(len(whole), 6, replace=False)
+            reduced = reduced_from(whole, rows)
+            assert not fixed or (reduced.norms == 0).any()
+            partitions.append(defensive_partition(reduced, flux, 40, rng))
+        return draw_representatives(partitions[-1], rng)
+
+    bias, error = deviation(estimates(whole, draw, 1000), whole)
+    assert error < 0.003 and abs(bias) < 4 * error, (bias, error)
+
+
+def test_what_rows_do_not_see_is_missing_in_the_published_estimate(whole: np.ndarray) -> None:
+    """The paper ignores columns that no row sees, and gives representatives their cluster's colour: it is biased.
+
+    Expected: with two rows, the mean of 1000 estimates is more than five standard errors off the sum of all columns.
+    """
+    rng = np.random.default_rng(0)
+    reduced = reduced_from(whole, rng.choice(len(whole), 2, replace=False))
+    partition = published_partition(reduced, 40, rng)
+    bias, error = deviation(
+        estimates(
+            whole, lambda k: draw_coloured_representatives(partition, reduced.channel_norms, rng), 1000
+        ),
+        whole,
+    )
+    print(f"published: {bias:.2%} +- {error:.2%}")
+    assert abs(bias) > 5 * error
+
+
+def test_a_representative_without_a_channel_keeps_its_scale() -> None:
+    channel_norms = np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 3.0]])
+    partition = Partition([np.arange(3)], np.array([1.0, 2.0, 3.0]), np.zeros(1))
+    for seed in range(9):
+        chosen = draw_coloured_representatives(partition, channel_norms, np.random.default_rng(seed))
+        scale = 6 / partition.drawing[chosen.ids[0]]
+        expected = np.full(3, scale)
+        expected[chosen.ids[0]] = 1.0
+        assert chosen.weights[0] == pytest.approx(expected)
+
+
+def test_the_predicted_error_is_that_of_the_image(whole: np.ndarray) -> None:
+    """Second representatives tell the expected error, over 200 estimates of one partition.
+
+    Rationale: that error is the sum of the variances of all clusters; a tenth of them is measured, drawn by cost and
+    energy, and counts by the inverse of its chance.
+    Expected: root mean squares of predicted and true errors within 15%; both vary by few percent over so many seeds.
+    """
+    rng = np.random.default_rng(1)
+    rows = rng.choice(len(whole), 20, replace=False)
+    partition = defensive_partition(reduced_from(whole, rows), np.ones(whole.shape[1]), 30, rng)
+    columns = whole.astype(np.float32)
+
+    def sum_columns(ids, weights, done):
+        return np.einsum("ijc,jc->ic", columns[:, ids], weights)
+
+    def each_column(ids, weights, done):
+        yield from (columns[:, j] * w for j, w in zip(ids, weights, strict=True))
+
+    twin = SimpleNamespace(
+        sum_columns=sum_columns, each_column=each_column, samples=SimpleNamespace(pixel_means=lambda v: v)
+    )
+    predicted, true = np.zeros(200), np.zeros(200)
+    for k in range(200):
+        found = sum_with_error(twin, partition, np.random.default_rng(k))
+        predicted[k], true[k] = found.squared_error, ((found.values - whole.sum(axis=1)) ** 2).sum()
+    assert np.sqrt(predicted.mean() / true.mean()) == pytest.approx(1, abs=0.15)
+
+
+def test_power_sampling_is_unbiased(whole: np.ndarray) -> None:
+    flux, rng = np.random.default_rng(0).random(whole.shape[1]) + 0.1, np.random.default_rng(1)
+    bias, error = deviation(estimates(whole, lambda k: draw_by_power(flux, 40, rng), 1000), whole)
+    assert abs(bias) < 4 * error < 0.04
+
+
+def test_with_as_many_clusters_as_lights_nothing_is_lost(matrix: Elements, whole: np.ndarray) -> None:
+    rows = matrix.samples.stratified_rows(8, 0)
+    partition = defensive_partition(
+        reduced_from(whole, rows), matrix.lights.flux, 10 * whole.shape[1], np.random.default_rng(0)
+    )
+    found = sum_with_error(matrix, partition, np.random.default_rng(1))
+    assert len(partition) <= whole.shape[1]
+    every = [len(own) for own in partition.clusters]
+    if max(every) == 1:
+        assert found.values == pytest.approx(whole.sum(axis=1), rel=1e-4) and found.squared_error == 0
+
+
+# -- baselines --------------------------------------------------------------------------------------------------------
+
+
+def test_all_lights_go_on_after_an_interruption(matrix: Elements, whole: np.ndarray, tmp_path) -> None:
+    expected = whole.sum(axis=1)
+    assert all_lights(matrix, Run(), tmp_path) == pytest.approx(expected, rel=1e-5)
+    before = matrix.evaluated
+    assert all_lights(matrix, Run(), tmp_path) == pytest.approx(expected, rel=1e-5)
+    assert matrix.evaluated - before <= 64 * 64  # what the name is made of
+    other = instant_radiosity(matrix, 300, LightOptions(max_depth=3, seed=9))
+    assert other.mean() == pytest.approx(expected.mean(), rel=0.1)
+
+
+# -- lights -----------------------------------------------------------------------------------------------------------
+
+
+def lights_of(max_depth: int = 2, count: int = 1000, **emitters: object):
+    scene = mi.load_dict({"type": "scene", "floor": FLOOR, **emitters})
+    return scene_lights(scene, LightOptions(count, max_depth=max_depth))
+
+
+def test_lights_have_the_power_of_their_emitters() -> None:
+    """Each kind beside its formula; of stratified samples, the sum is exact where radiance is even."""
+    area = lights_of(lamp=LAMP)
+    assert area.arrays.power.numpy().sum(axis=1) == pytest.approx(np.array([6, 5, 4]) * 1.0, rel=1e-4)
+    assert area.flux.sum() == pytest.approx(np.pi * 5, rel=1e-4)
+    sky = lights_of(sky={"type": "constant", "radiance": 0.5})
+    assert sky.arrays.power.numpy().sum(axis=1) == pytest.approx(np.full(3, 4 * np.pi * 0.5), rel=1e-4)
+    point = lights_of(point={"type": "point", "position": [0, 1, 0], "intensity": 2.0})
+    assert len(point) == 1 and point.flux[0] == pytest.approx(8 * np.pi, rel=1e-3)
+    sun = lights_of(sun={"type": "directional", "direction": [0, -1, 0], "irradiance": 3.0})
+    assert len(sun) == 1 and sun.arrays.power.numpy().ravel() == pytest.approx(3)
+
+
+def test_a_sun_is_one_light() -> None:
+    found = lights_of(sky={"type": "sunsky", "to_world": T().rotate([1, 0, 0], -90)})
+    power = np.sort(found.arrays.power.numpy().sum(axis=0))
+    assert 900 < len(found) < 1100 and power[-1] > 100 * power[-2]
+
+
+def test_lights_are_grouped_by_emitter_and_limited_by_depth() -> None:
+    point = {"type": "point", "position": [0, 1, 0], "intensity": 2.0}
+    found = lights_of(4, 2000, lamp=LAMP, point=point, wall={**FLOOR, "to_world": T().translate([0, 1, -2])})
+    counts = found.counts()
+    assert set(counts) == {"lamp", "point"} and counts["point"]["direct"] == 1
+    assert min(own["indirect"] for own in counts.values()) > 100
+    assert 1800 < len(found) < 2200 and set(found.arrays.depth.numpy()) == {2, 3, 4}
+
+
+def test_what_a_floor_reflects_is_its_albedo_times_what_lands() -> None:
+    """Flux of lights on a floor under a point in the middle of a half space: half of its power lands, or nearly.
+
+    Expected: albedo times the share of the sphere that the floor covers, within four standard errors.
+    """
+    point = {"type": "point", "position": [0, 0.2, 0], "intensity": 1.0}
+    found = lights_of(3, 40_000, point=point)
+    indirect = found.arrays.depth.numpy() == 3
+    grid = np.linspace(-2, 2, 801)
+    x, z = np.meshgrid((grid[1:] + grid[:-1]) / 2, (grid[1:] + grid[:-1]) / 2)
+    solid_angle = (0.2 / (x**2 + z**2 + 0.04) ** 1.5).sum() * (4 / 800) ** 2
+    n = indirect.sum()
+    error = np.sqrt((1 - solid_angle / (4 * np.pi)) / n)
+    assert found.flux[indirect].sum() == pytest.approx(solid_angle * 0.5, rel=4 * error)
+
+
+# -- what is refused, and what is dark -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("things", "message"),
+    [
+        ({"l": {"type": "rectangle", "emitter": {"type": "directionalarea"}}}, "DirectionalArea"),
+        ({"fog": {"type": "cube", "interior": {"type": "homogeneous"}, "b": {"type": "null"}}}, "medium"),
+    ],
+)
+def test_unknown_lights_and_media_are_refused(things: dict, message: str) -> None:
+    with pytest.raises(prt.PrtError, match=message):
+        prt.render_many_lights(room(**things), **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rows": 0}, "rows is 0"),
+        ({"columns": -1}, "columns is -1"),
+        ({"seconds": 0.0}, "seconds"),
+        ({"method": "best"}, "method 'best'"),
+        ({"lights": 0}, "0 lights"),
+        ({"max_depth": 1}, "max_depth is 1"),
+        ({"clamp": 0.0}, "clamp"),
+        ({"sensor": 3}, "no sensor 3"),
+        ({"spp": 0}, "spp is 0"),
+        ({"samples": 4}, "samples"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(small_room: mi.Scene, settings: dict, message: str) -> None:
+    with pytest.raises(prt.PrtError, match=message):
+        prt.render_many_lights(small_room, **settings)
+
+
+def test_a_bsdf_that_is_not_finite_is_named_with_shape_and_light(small_room: mi.Scene) -> None:
+    bad = mi.load_dict(diffuse(0.5, 0.5, 0.5))
+    parameters = mi.traverse(bad)
+    parameters["reflectance.value"] = mi.Color3f(float("nan"))
+    scene = room(ball={"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": bad})
+    with pytest.raises(prt.PrtError, match=r"shape 'ball' .*light \d+ of emitter 'lamp'"):
+        prt.render_many_lights(scene, **{**SMALL, "max_depth": 2})
+
+
+@pytest.mark.parametrize("method", ["adaptive", "hasan2007"])
+def test_scenes_with_little_in_them_have_images(small_room: mi.Scene, method: str) -> None:
+    """No light, nothing seen, an environment alone, a lamp behind a wall, a lamp of 1e-6 of the power of another."""
+    weak = {**LAMP, "emitter": {"type": "area", "radiance": 6e-6}}
+    wall = {**LAMP, "to_world": T().translate([0, 2.4, 0]).rotate([1, 0, 0], -90).scale(3)}
+    wall["bsdf"] = wall.pop("emitter") and diffuse(0.5, 0.5, 0.5)
+    sky = {"type": "constant", "radiance": 0.25}
+    for scene, mean in (
+        (room(lamp=None), 0.0),
+        (mi.load_dict({"type": "scene", "sensor": camera(), "sky": sky}), 0.25),
+        (room(wall={**wall, "bsdf": {"type": "twosided", "bsdf": wall["bsdf"]}}), None),
+        (room(weak={**weak, "to_world": T().translate([1, 2, 0]).rotate([1, 0, 0], 90)}), None),
+    ):
+        found = prt.render_many_lights(scene, method=method, **SMALL)
+        assert np.isfinite(found.image).all() and found.image.shape == (16, 16, 3)
+        assert mean is None or found.image.mean() == pytest.approx(mean)
+        json.dumps(found.report)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (1, 50), (50, 1), (10**6, 10**6)])
+def test_any_number_of_rows_and_columns_has_an_image(
+    small_room, matrix, whole, rows: int, columns: int
+) -> None:
+    asked = {**SMALL, "rows": rows, "columns": columns}
+    for method in ("adaptive", "hasan2007"):
+        found = prt.render_many_lights(small_room, method=method, **asked)
+        assert np.isfinite(found.image).all()
+    if columns == 10**6:
+        exact = matrix.samples.image(whole.sum(axis=1).astype(np.float32))
+        assert found.image == pytest.approx(exact, rel=1e-3, abs=1e-5)
+
+
+# -- what comes out ---------------------------------------------------------------------------------------------------
+
+
+def test_a_crop_is_a_part_of_the_picture() -> None:
+    """The sky alone, through a film and a crop of it: the same directions, other samples.
+
+    Expected: within 2% on average.
+    """
+    sky = {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)),
+    }
+    whole, part = (
+        mi.load_dict({"type": "scene", "sky": sky, "sensor": camera(24, **film)})
+        for film in ({}, {"crop_width": 10, "crop_height": 8, "crop_offset_x": 3, "crop_offset_y": 12})
+    )
+    images = [prt.render_many_lights(scene, spp=16, **SMALL).image for scene in (whole, part)]
+    assert images[1].shape == (8, 10, 3)
+    assert images[1] == pytest.approx(images[0][12:20, 3:13], abs=0.02)
+
+
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba", "luminance"])
+def test_the_integrator_fills_films_of_any_format(pixel_format: str) -> None:
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": FLOOR,
+            "lamp": LAMP,
+            "sensor": camera(pixel_format=pixel_format, crop_width=10, crop_height=12),
+            "integrator": {"type": "row_column", "rows": 12, "columns": 20, "lights": 300, "max_depth": 3},
+        }
+    )
+    image = np.array(mi.render(scene, spp=4))
+    found = prt.render_many_lights(scene, **SMALL)
+    expected = {
+        "rgb": found.image,
+        "rgba": np.dstack([found.image, found.alpha]),
+        "luminance": np.array(mi.luminance(mi.Color3f(found.image.reshape(-1, 3).T))).reshape(12, 10, 1),
+    }[pixel_format]
+    assert image == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_integrator_complains_when_it_is_made() -> None:
+    with pytest.raises(Exception, match="rows is -1"):
+        mi.load_dict({"type": "row_column", "rows": -1})
+
+
+def test_a_time_budget_chooses_rows_and_columns(small_room: mi.Scene) -> None:
+    early = []
+    found = prt.render_many_lights(
+        small_room, seconds=0.5, lights=300, max_depth=3, preview=lambda image: early.append(image)
+    )
+    assert found.report["rows"] >= 16 and found.report["columns"] >= 48
+    assert len(early) == 1 and early[0].shape == found.image.shape
+    assert found.report["seconds"]["total"] < 5
