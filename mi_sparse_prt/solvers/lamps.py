@@ -11,6 +11,7 @@ from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, trace_reflected
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -34,6 +35,7 @@ class LampRays:
     def __init__(self, problem: Problem, strata: int = 16, seed: int = 0) -> None:
         self._emission: SampledEmission = problem.emission
         self._scene, self._strata, self._seed = problem.scene, strata, seed
+        self._max_depth = problem.max_depth
         self._points = PointArrays(problem.points)
 
     @property
@@ -88,9 +90,18 @@ class LampRays:
         lit = (cosine > 0) & (dr.max(irradiance) > 0)
         lamp_at = self._points.position(point) + direction * (distance * self._scene.scale)
         ray = ray_to(start_ray(self._points, point, direction), lamp_at)
-        lit &= ~self._scene.normalised.ray_test(ray, lit)
-        value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0)
+        value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0) * self._arriving(ray, lamp_at, lit)
         return [value.x, value.y, value.z]
+
+    def _arriving(self, ray: mi.Ray3f, lamp_at: mi.Point3f, active: mi.Mask) -> mi.Color3f:
+        """The share of light that arrives along shadow rays: what masks, thin panes and ``null`` let through counts."""
+        scene = self._scene.normalised
+        if not self._scene.passes_straight:
+            return dr.select(scene.ray_test(ray, active), mi.Color3f(0), 1)
+        most = dr.opaque(mi.UInt32, self._max_depth - 2 if self._max_depth >= 0 else 1 << 30)
+        onwards = lambda si: ray_to(si.spawn_ray(ray.d), lamp_at)  # noqa: E731
+        share, _, _ = pass_straight(scene, ray, active, most, onwards, lambda passed: passed)
+        return share
 
 
 class LampPaths(PathSolver):
