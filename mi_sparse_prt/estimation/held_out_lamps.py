@@ -11,11 +11,13 @@ from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
 from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
 
 POINTS = 256  # of each group, at most
 ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has fewer points
 SPP = 256
+STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 
 
 def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) -> HeldOutError:
@@ -43,4 +45,17 @@ def _true(problem: Problem, asked: tuple[Any, Any], rays: int, paths: int) -> ND
     found = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
     if problem.max_depth != 2:
         found += LampPaths(problem, SPP, paths).elements(*asked).mean
+        found += _by_mirrors(problem, asked, rays)
+    return found
+
+
+def _by_mirrors(problem: Problem, asked: tuple[Any, Any], seed: int) -> NDArray[np.float64]:
+    """What mirrors and glass bring (m, 3): rays into each cell that sees any."""
+    found = np.zeros((len(asked[0]), 3))
+    if problem.scene.bends_light:
+        ids, place = np.unique(asked[0], return_inverse=True)
+        light = specular_light(problem, seed, SpecularOptions(STRATA, STRATA), ids)
+        for channel in range(3):
+            matrix = light.matrices[channel % len(light.matrices)].toarray()
+            found[:, channel] = matrix[place, asked[1]]
     return found

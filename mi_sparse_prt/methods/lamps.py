@@ -15,8 +15,10 @@ from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
+from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 
 BLOCK = 4096  # points at a time
+NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct light together with it
 SPP = 64  # paths of an element, where nothing else says how many
 
 
@@ -34,8 +36,8 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
         strata**2 shadow rays per point and lamp.
     """
     sources = problem.at_vertices
-    direct = _direct(problem, run, strata)
-    own = direct if sources is problem else _direct(sources, run, strata)
+    direct, arriving = _direct(problem, run, strata)
+    own = direct if sources is problem else _direct(sources, run, strata)[0]
     indirect, traced = None, 0
     if problem.max_depth != 2:
         with run.clock.phase("gather_rays"):
@@ -46,12 +48,13 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
             if sources is not problem:
                 indirect = _seen_from(problem, own + indirect, rays, run.seed)
                 traced += len(problem.points) * rays
-    return _result(problem, direct, indirect, {"direct": direct[..., 0].size * strata**2, "gather": traced})
+    counts = {"direct": direct[..., 0].size * strata**2, "specular": arriving, "gather": traced}
+    return _result(problem, direct, indirect, counts)
 
 
 def path_traced_lamps(problem: Problem, run: Run, spp: int = SPP, strata: int = 16) -> MethodResult:
     """By path tracing: any BSDF."""
-    direct = _direct(problem, run, strata)
+    direct, arriving = _direct(problem, run, strata)
     indirect = None
     if problem.max_depth != 2:
         with run.clock.phase("indirect"):
@@ -62,18 +65,25 @@ def path_traced_lamps(problem: Problem, run: Run, spp: int = SPP, strata: int = 
                 found = solver.elements(np.repeat(ids, m), np.tile(np.arange(m), len(ids)))
                 indirect[ids] = found.mean.reshape(len(ids), m, 3)
     elements = direct[..., 0].size
-    rays = {"direct": elements * strata**2, "indirect_paths": 0 if indirect is None else elements * spp}
+    rays = {"direct": elements * strata**2, "specular": arriving}
+    rays["indirect_paths"] = 0 if indirect is None else elements * spp
     return _result(problem, direct, indirect, rays)
 
 
-def _direct(problem: Problem, run: Run, strata: int) -> Floats:
-    """Unit-albedo direct light (n, m, 3)."""
+def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, int]:
+    """Unit-albedo light (n, m, 3) that no diffuse surface sent on; how many rays looked for it in mirrors and glass."""
     solver = LampRays(problem, strata, run.seed)
     with run.clock.phase("direct"):
         result = np.empty((len(problem.points), problem.emission.size, 3), np.float32)
         for ids in _blocks(len(result), BLOCK, "direct", run):
             result[ids] = solver.rows(ids)
-    return result
+    if not problem.scene.bends_light or problem.max_depth == 2:
+        return result, 0
+    with run.clock.phase("specular"):
+        found = specular_light(problem, run.seed, SpecularOptions(error=NOISE))
+    for channel in range(3):
+        result[..., channel] += found.matrices[channel % len(found.matrices)].toarray()
+    return result, found.rays
 
 
 def _seen_from(problem: Problem, light: Floats, rays: int, seed: int) -> Floats:

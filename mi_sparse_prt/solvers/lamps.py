@@ -12,7 +12,7 @@ from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import pass_straight
-from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, trace_reflected
+from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, has_mirrors, trace_reflected
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
@@ -107,6 +107,8 @@ class LampRays:
 class LampPaths(PathSolver):
     """Indirect light of lamps at points, by path tracing: elements (m, 3), times 1 rather than per solid angle.
 
+    What comes by way of mirrors and glass alone is not part of it (``solvers.specular``).
+
     Parameters
     ----------
     problem : Problem
@@ -130,7 +132,21 @@ class LampPaths(PathSolver):
             direction, irradiance, distance = self._emission.sample(texel, to_world(self._world, si.p), uv)
             return direction, irradiance, distance * self._world.scale
 
-        return trace_reflected(self.scene, ray, Light(sample), rng, bounces)
+        def met(ray: mi.Ray3f, active: mi.Mask) -> mi.Color3f:
+            lamp, radiance = lamp_met(self.problem, ray, active)
+            return dr.select(active & (lamp == mi.Int32(texel)), radiance, 0)
+
+        light = Light(sample, scattered=True)
+        if has_mirrors(self.scene):
+            light.met = met
+        return trace_reflected(self.scene, ray, light, rng, bounces)
+
+
+def lamp_met(problem: Problem, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Int32, mi.Color3f]:
+    """The lamp that rays (normalised frame) meet, -1 for none, and its radiance."""
+    world = mi.Ray3f(to_world(problem.scene, ray.o), ray.d)
+    si = problem.scene.mitsuba.ray_intersect(world, active)
+    return problem.emission.element_of(si, world, active)
 
 
 def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:

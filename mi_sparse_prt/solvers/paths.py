@@ -199,6 +199,8 @@ class Light:
         Only paths collect it that another surface has scattered on the way, and not by mirrors and glass alone.
     rough_glass : sequence of mi.BSDF
         These are glass as well, then.
+    met : callable, optional
+        Of lamps, in place of ``contains``: the radiance that rays meet right after a mirror.
     """
 
     sample: Callable[[Any, Any], tuple[Any, Any, Any]]
@@ -206,6 +208,7 @@ class Light:
     radiance: mi.Float | None = None
     scattered: bool = False
     rough_glass: Sequence[mi.BSDF] = ()
+    met: Callable[[mi.Ray3f, mi.Mask], mi.Color3f] | None = None
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
@@ -237,6 +240,9 @@ def trace_reflected(
         if light.contains is not None:
             escaped = active & mirrored & counts & ~si.is_valid()
             result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
+        if light.met is not None:
+            found = light.met(ray, active & mirrored & counts)
+            result += dr.select(active & mirrored & counts, throughput * found, 0)
         active &= si.is_valid() & (depth < bounces)
 
         # Light, from one direction
@@ -264,7 +270,7 @@ def trace_reflected(
         mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
         counts |= ~mirrored & ~rough
         active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
-        if light.contains is None:
+        if light.contains is None and light.met is None:
             active &= depth < bounces
         else:  # one more ray after the last mirror, to see the light itself
             active &= (depth < bounces) | mirrored & (depth == bounces)

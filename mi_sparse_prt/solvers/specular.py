@@ -1,4 +1,4 @@
-"""Light that arrives from the sky by way of mirrors, glass and masks.
+"""Light that arrives from the sky, or from lamps, by way of mirrors, glass and masks.
 
 It is sharp and noisy: an operator of its own, with few elements, found by as many rays as its noise asks for. What
 goes straight through (masks, thin panes, ``null``) needs no random rays: see ``passed_light``.
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
+from mi_sparse_prt.solvers.lamps import LampRays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, SpecularChains
 
@@ -132,7 +134,9 @@ def specular_light(
     options: SpecularOptions = SpecularOptions(),  # noqa: B008
     ids: Ids | None = None,
 ) -> SpecularLight:
-    """Light from the sky that arrives by way of mirrors and glass, at some points.
+    """Light from the sky, or of lamps, that arrives by way of mirrors and glass, at some points.
+
+    Of lamps, light that passes straight on is not part of it (``LampRays`` has that).
 
     A few rays tell in which cells of its hemisphere a point sees specular surfaces; those are sampled, finer where more
     light arrives, until the noise is small enough. What is smaller than a cell, and met by no ray, is not found.
@@ -148,14 +152,15 @@ def specular_light(
     every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
     seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 64)]
     power = np.square(problem.reflection.albedo[every].astype(np.float64))
-    parts = int(problem.scene.bends_light) + int(problem.scene.passes_straight)
+    passes = problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting)
+    parts = int(problem.scene.bends_light) + int(passes)
     share = options.error**2 / max(parts, 1)
     direct = _direct_norm(problem, every, power, seeds[-1])
     limit = _Limit(share, share * direct)
     found, seen = [], None
     if problem.scene.bends_light:
         found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
-    if problem.scene.passes_straight:
+    if passes:
         passing = _Passing(problem, every, power, seeds[32:])
         found.append(passing.refined(options, limit))
         seen = passing.seen
@@ -225,9 +230,9 @@ class _Arriving:
             part = slice(starts[first], starts[last])
             here, some = self._ids[lit[first:last]], self._cells.take(part)
             some = some._replace(rows=np.searchsorted(lit[first:last], some.rows))
-            sky = self._chains.gather_sky(here, some, strata[part], seed)
-            found.append(sky.light)
-            squares.append(sky.squares)
+            arrived = self._chains.gather_light(here, some, strata[part], seed)
+            found.append(arrived.light)
+            squares.append(arrived.squares)
             first = last
         channels = [scipy.sparse.vstack(blocks, format="csr") for blocks in zip(*found, strict=True)]
         return [_spread(m, lit, none.shape) for m in channels] or [none] * 3, np.concatenate(squares)
@@ -388,9 +393,12 @@ def _direct_norm(problem: Problem, ids: Ids, power: Doubles, seed: int) -> float
     some = np.random.default_rng(seed).permutation(len(ids))[:SAMPLE]
     size = problem.emission.size
     place = np.repeat(ids[some], size), np.tile(np.arange(size), len(some))
-    light = DirectSolver(problem, 1, seed).elements(*place).astype(np.float64)
-    squares = np.square(light).reshape(len(some), size).sum(axis=1)
-    return float(squares @ power[some].sum(axis=1)) * len(ids) / max(len(some), 1)
+    if isinstance(problem.emission, CubemapLighting):
+        light = DirectSolver(problem, 1, seed).elements(*place).astype(np.float64)[:, None]
+    else:
+        light = LampRays(problem, 4, seed).elements(*place).mean.astype(np.float64)
+    squares = np.square(light).reshape(len(some), size, -1).sum(axis=1) * np.ones(3)
+    return float((squares * power[some]).sum()) * len(ids) / max(len(some), 1)
 
 
 def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
+from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
+from mi_sparse_prt.solvers.lamps import lamp_met
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
@@ -56,7 +58,7 @@ class Cells(NamedTuple):
         return Cells(self.rows[part], self.numbers[part], self.shares[part])
 
 
-class SkyLight(NamedTuple):
+class ArrivedLight(NamedTuple):
     """What rays into cells found.
 
     Attributes
@@ -65,11 +67,19 @@ class SkyLight(NamedTuple):
         Unit-albedo transport of points: side by side that of light which met 1, 2, ... k surfaces, where it is told
         apart by these; else k is 1.
     squares : (m,) float32
-        Of the weights of rays that left the scene, summed over those of each cell.
+        Of the weights of rays that found light, summed over those of each cell.
     """
 
     light: list[Sparse]
     squares: NDArray[np.float32]
+
+
+class _Rays(NamedTuple):
+    """Rays on the device, the number that each was given, and random numbers."""
+
+    ray: Any
+    of: Any
+    rng: Any
 
 
 class _Ends(NamedTuple):
@@ -87,14 +97,15 @@ class SpecularChains:
     Parameters
     ----------
     problem : Problem
-        Light of a cubemap.
+        Light of a cubemap, or of lamps that rays can meet.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._scene, self._surfaces = problem.scene.normalised, Surfaces(problem.scene)
+        self._problem = problem
         self._rough_glass = problem.scene.rough_glass
         self._points = PointArrays(problem.points)
-        self._resolution, self._texels = problem.emission.resolution, problem.emission.size
+        self._of_sky, self._size = isinstance(problem.emission, CubemapLighting), problem.emission.size
         depth, self._apart = problem.max_depth, problem.depths_apart
         self._longest = LONGEST if depth < 0 else min(depth - 2, LONGEST)
 
@@ -112,8 +123,8 @@ class SpecularChains:
             found.append((a + row, number, grown[row, number]))
         return Cells(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
-    def gather_sky(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> SkyLight:
-        """Light of texels to which rays from points leave the scene, but for those that went straight all the way.
+    def gather_light(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> ArrivedLight:
+        """Light of texels to which rays from points leave the scene, or of lamps; not of those that went straight on.
 
         Parameters
         ----------
@@ -125,18 +136,41 @@ class SpecularChains:
             Per axis of each cell, each with a ray.
         seed : int
         """
-        ray, entry, rng = self._rays_into(ids, cells, strata, seed)
+        rays = self._rays_into(ids, cells, strata, seed)
+        gather = self._of_texels if self._of_sky else self._of_lamps
+        return gather(rays, len(ids), cells.rows, strata)
+
+    def _of_lamps(
+        self, rays: _Rays, n: int, rows: NDArray[np.int64], strata: NDArray[np.int64]
+    ) -> ArrivedLight:
+        """Sums of few columns, however bright, in the order of rays."""
+        sums, squares = np.zeros((3, n * self._size)), np.zeros(len(strata))
+        for ends in self._follow(*rays, True):
+            kept = ends.valid.numpy()
+            of, column = ends.of.numpy()[kept], ends.column.numpy()[kept]
+            weight = ends.weight.numpy()[:, kept].astype(np.float64)
+            share, place = 1 / (CELLS * strata[of].astype(float)) ** 2, rows[of] * self._size + column
+            for total, own in zip(sums, weight, strict=True):
+                total += np.bincount(place, own * share, len(total))
+            squares += np.bincount(of, weight.max(axis=0) ** 2, len(squares))
+        light = [scipy.sparse.csr_array(total.reshape(n, -1).astype(np.float32)) for total in sums]
+        return ArrivedLight(light, squares.astype(np.float32))
+
+    def _of_texels(
+        self, rays: _Rays, n: int, rows_of: NDArray[np.int64], strata: NDArray[np.int64]
+    ) -> ArrivedLight:
+        """Sums of many columns, of which few are not 0, on the device."""
         rows, scale = (
-            mi.UInt32(cells.rows.astype(np.uint32)),
+            mi.UInt32(rows_of.astype(np.uint32)),
             FIXED_POINT / (CELLS * strata.astype(float)) ** 2,
         )
         scales = mi.Float(scale.astype(np.float32))
-        columns = self._texels * max(self._apart, 1)
-        sums = [dr.zeros(mi.UInt32, len(ids) * columns) for _ in range(3)]
+        columns = self._size * max(self._apart, 1)
+        sums = [dr.zeros(mi.UInt32, n * columns) for _ in range(3)]
         squares = dr.zeros(mi.UInt32, len(strata))
         # whole numbers: sums do not depend on the order of rays
-        for depth, ends in enumerate(self._follow(ray, entry, rng, True)):
-            first = dr.opaque(mi.UInt32, depth * self._texels if self._apart else 0)
+        for depth, ends in enumerate(self._follow(*rays, True)):
+            first = dr.opaque(mi.UInt32, depth * self._size if self._apart else 0)
             place = dr.gather(mi.UInt32, rows, ends.of) * columns + first + ends.column
             unit = dr.gather(mi.Float, scales, ends.of)
             for c, total in enumerate(sums):
@@ -146,7 +180,7 @@ class SpecularChains:
             square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
             dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid)
         dr.eval(*sums, squares)
-        return SkyLight(_compressed(sums, (len(ids), columns)), squares.numpy() / np.float32(2**16))
+        return ArrivedLight(_compressed(sums, (n, columns)), squares.numpy() / np.float32(2**16))
 
     def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> list[Sparse]:
         """What cosine-distributed rays from some points find after 1, 2, ... specular surfaces, by vertices (n, n_v).
@@ -168,9 +202,7 @@ class SpecularChains:
                 ).tocsr()
         return found
 
-    def _rays_into(
-        self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int
-    ) -> tuple[mi.Ray3f, mi.UInt32, mi.PCG32]:
+    def _rays_into(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> _Rays:
         """Rays into cells, one in each stratum, the cells that they belong to, and random numbers for the rest."""
         counts = strata**2
         of_lane = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
@@ -191,7 +223,7 @@ class SpecularChains:
         )
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, y))
         direction = mi.Frame3f(self._points.normal(point)).to_world(local)
-        return start_ray(self._points, point, direction), entry, rng
+        return _Rays(start_ray(self._points, point, direction), entry, rng)
 
     def _shares(self, ray: mi.Ray3f, rng: mi.PCG32) -> NDArray[np.float32]:
         """Of light, that what each ray meets sends on; 0 if that is no specular surface."""
@@ -215,8 +247,8 @@ class SpecularChains:
     def _is_specular(self, si: mi.SurfaceInteraction3f) -> mi.Mask:
         return mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) | is_one_of(self._rough_glass, si)
 
-    def _follow(self, ray: mi.Ray3f, of: mi.UInt32, rng: mi.PCG32, to_sky: bool) -> Iterator[_Ends]:
-        """Rays that end after one specular surface, after two, ...: at texels of the sky, or at vertices."""
+    def _follow(self, ray: mi.Ray3f, of: mi.UInt32, rng: mi.PCG32, to_light: bool) -> Iterator[_Ends]:
+        """Rays that end after one specular surface, after two, ...: at texels of the sky, at lamps, or at vertices."""
         hit, met = self._specular_hits(ray)
         dr.eval(hit, met, ray, of, rng)
         index = dr.compress(met)  # few of them
@@ -232,20 +264,30 @@ class SpecularChains:
             straight &= mi.has_flag(scattered.sampled_type, mi.BSDFFlags.Null)
             ray = si.spawn_ray(si.to_world(scattered.wo))
             hit = self._scene.ray_intersect_preliminary(ray, active=goes_on)
-            valid = hit.is_valid()
-            if to_sky:
-                texel = texel_at(*face_coordinates(ray.d), self._resolution)
-                column = dr.select(valid | straight, NOTHING, texel)
+            valid, radiance = hit.is_valid(), mi.Color3f(1)
+            if to_light:
+                column, radiance = self._light_met(hit, ray, goes_on & ~straight)
             else:
                 column = dr.select(valid, self._surfaces.corner(hit, ray, rng.next_float32()), NOTHING)
-            ends = goes_on & (column != NOTHING) & (dr.max(weight) > 0)
+            brought = weight * radiance
+            ends = goes_on & (column != NOTHING) & (dr.max(brought) > 0)
             alive = goes_on & valid & (dr.max(weight) > 0)
-            dr.eval(of, column, weight, ends, alive, ray, rng, straight, hit)
-            yield _Ends(of, column, weight, ends)
+            dr.eval(of, column, weight, brought, ends, alive, ray, rng, straight, hit)
+            yield _Ends(of, column, brought, ends)
             index = dr.compress(alive)
             of, weight, straight, ray, rng, hit = (
                 dr.gather(type(x), x, index) for x in (of, weight, straight, ray, rng, hit)
             )
+
+    def _light_met(
+        self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Mask
+    ) -> tuple[mi.UInt32, mi.Color3f]:
+        """The column of what rays meet that shines, NOTHING for none, and its radiance."""
+        if self._of_sky:
+            texel = texel_at(*face_coordinates(ray.d), self._problem.emission.resolution)
+            return dr.select(active & ~hit.is_valid(), texel, NOTHING), mi.Color3f(1)
+        lamp, radiance = lamp_met(self._problem, ray, active)
+        return dr.select(lamp >= 0, mi.UInt32(lamp), NOTHING), radiance
 
     def _scattered(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask

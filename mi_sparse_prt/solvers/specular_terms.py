@@ -98,7 +98,7 @@ class _TermChains(SpecularChains):
                     x[kept] for x in (ends.of.numpy(), ends.column.numpy(), ends.weight.numpy().T)
                 )
                 share = light / np.float32((CELLS * STRATA) ** 2)
-                columns = texels.astype(np.int64) + (depth * self._texels if self._apart else 0)
+                columns = texels.astype(np.int64) + (depth * self._size if self._apart else 0)
                 yield _Light(of_lane[lanes], columns, into[lanes], share)
 
 
