@@ -22,10 +22,13 @@ from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
     SECOND,
     Estimate,
+    LocalPartitions,
     Partition,
     defensive_partition,
     draw_coloured_representatives,
+    everywhere,
     published_partition,
+    refined,
     sum_with_error,
 )
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
@@ -43,6 +46,8 @@ _PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
 
 PILOT = 16  # rows, and columns, that tell what others cost
 CLUSTERING = 7e-9  # seconds for each light and cluster
+ROWS_PER_SLICE = 16  # at which samples are apart in slices, with clusters of their own
+GLOBAL = 0.6  # of the clusters are found for all samples
 EARLY = 9  # times fewer columns for a preview
 RESERVE = 0.05  # of a time budget
 
@@ -264,21 +269,27 @@ class RowColumn:
         with self.run.clock.phase("rows"), self.run.bar(len(ids), "rows") as bar:
             return self.elements.reduce_columns(ids, projection, bar.update)
 
-    def partition(self, reduced: ReducedColumns, columns: int) -> Partition:
-        """Clusters by the method."""
+    def partition(self, reduced: ReducedColumns, columns: int) -> Partition | LocalPartitions:
+        """Clusters by the method; of ``adaptive``, a part of them is refined for slices of samples."""
         rng = self.settings.random(_CLUSTER)
         with self.run.clock.phase("clustering"):
             if self.settings.method == "hasan2007":
                 return published_partition(reduced, columns, rng)
-            return defensive_partition(reduced, self.lights.flux, columns, rng)
+            slices = len(reduced.rows) // ROWS_PER_SLICE
+            globally = columns if slices < 2 else max(1, round(GLOBAL * columns))
+            partition = defensive_partition(reduced, self.lights.flux, globally, rng)
+            if slices < 2:
+                return everywhere(partition, len(self.samples))
+            labels, rows_of = self.samples.slices(reduced.rows, slices, self.lights.radius)
+            return refined(partition, reduced, labels, rows_of, columns, rng)
 
-    def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
+    def summed(self, reduced: ReducedColumns, partition: Partition | LocalPartitions) -> Estimate:
         """The sum of all columns by those that represent their clusters."""
         rng = self.settings.random(_DRAW)
-        published = self.settings.method == "hasan2007"
+        published = isinstance(partition, Partition)
         total = len(partition) if published else round((1 + SECOND) * len(partition))
         with self.run.clock.phase("columns"), self.run.bar(total, "columns", " columns") as bar:
-            if published:
+            if isinstance(partition, Partition):
                 chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
             return sum_with_error(self.elements, partition, rng, bar.update)

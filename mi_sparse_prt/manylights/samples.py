@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
@@ -22,7 +23,10 @@ LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
 BENT = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
 _CAMERA = 0x5A17  # key of random numbers
 
+LEAST_ROWS = 12  # of a slice of samples
+
 Floats = NDArray[np.float32]
+Ids = NDArray[np.int64]
 
 
 @dataclass
@@ -166,6 +170,46 @@ class Samples:
         """The first row of each pixel that has some."""
         return np.unique(self.ids // self.spp, return_index=True)[1]
 
+    def slices(self, rows: NDArray[np.integer], count: int, radius: float) -> tuple[Ids, list[Ids]]:
+        """Samples that lie near each other and face alike, in slices around some rows.
+
+        Parameters
+        ----------
+        rows : (r,) integers
+        count : int
+            Slices, at most.
+        radius : float
+            Of the scene: normals that are at right angles count as much as half of it.
+
+        Returns
+        -------
+        slices : (m,) int64
+        rows_of : list of (k,) int64
+            Of each slice, the rows that tell most about it, by their places in ``rows``: at least ``LEAST_ROWS``.
+        """
+        features = self._features(radius)
+        centres, label = kmeans2(features[rows], count, minit="++", rng=0, missing="warn", iter=10)
+        centres = centres[np.unique(label)]
+        nearest = np.concatenate(
+            [
+                _squared_distances(part, centres).argmin(axis=1)
+                for part in np.array_split(features, max(1, len(features) >> 16))
+            ]
+        )
+        away = _squared_distances(features[rows], centres)
+        own = away.argmin(axis=1)
+        rows_of = []
+        for k in range(len(centres)):
+            order = np.argsort(away[:, k], kind="stable")
+            rows_of.append(np.union1d(np.flatnonzero(own == k), order[:LEAST_ROWS]))
+        return nearest, rows_of
+
+    def _features(self, radius: float) -> Floats:
+        si = self._hit.compute_surface_interaction(self._ray)
+        normal = dr.mulsign(mi.Vector3f(si.sh_frame.n), mi.Frame3f.cos_theta(si.wi))
+        found = np.concatenate([si.p.numpy() / radius, normal.numpy() * np.float32(0.25 * np.sqrt(2))])
+        return np.ascontiguousarray(found.T, np.float32)
+
     def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
         """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.
 
@@ -186,6 +230,11 @@ class Samples:
         u = np.random.default_rng([seed, _CAMERA]).random(count)
         at = ((np.arange(count) + u) * (len(self) / max(count, 1))).astype(np.int64)
         return order[np.minimum(at, len(self) - 1)]
+
+
+def _squared_distances(x: Floats, centres: Floats) -> Floats:
+    """(n, k), but for what depends on x alone."""
+    return (centres**2).sum(axis=1) - 2 * (x @ centres.T)
 
 
 def _camera_rays(sensor: mi.Sensor, places: Floats, seed: int) -> tuple[mi.Ray3f, mi.Color3f, mi.PCG32]:

@@ -145,7 +145,10 @@ def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
 
 def split_cluster(x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
     """A cluster of two or more, cut at the best place along a random line of directions."""
-    along = x[members] @ rng.normal(size=x.shape[1]) / norms[members]
+    along = x[members] @ rng.normal(size=x.shape[1])
+    np.divide(
+        along, norms[members], out=along, where=norms[members] > 0
+    )  # where some are zero, for all that matters
     ordered = members[np.argsort(along, kind="stable")]
     before = costs_of_first(x[ordered], norms[ordered])[:-1]
     after = costs_of_first(x[ordered[::-1]], norms[ordered[::-1]])[:-1][::-1]
