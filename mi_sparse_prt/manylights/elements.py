@@ -179,6 +179,41 @@ class Elements:
                 self._check_sum(values, np.unique(ids))
                 yield values
 
+    def sum_pairs(
+        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
+    ) -> tuple[Floats, NDArray[np.float64]]:
+        """Sums of the means of pairs of columns (m, 3), and how far apart those of each pair are.
+
+        Parameters
+        ----------
+        ids : (n_slices, 2 k) integers
+            Both columns of a pair follow each other.
+        weights : (n_slices, 2 k, 3) float32
+        done, slices
+            As for ``sum_columns``.
+
+        Returns
+        -------
+        sums : (m, 3) float32
+        squares : (k,) float64
+            Of the differences, as the means of pixels have them, over pixels and channels.
+        """
+        m, pairs = len(self.samples), np.shape(ids)[-1] // 2
+        chosen, total = _chosen(ids, weights, slices, m), dr.zeros(mi.Color3f, m)
+        squares = np.zeros(pairs)
+        for a in range(0, pairs, step := max(1, LANES // m)):
+            count = min(step, pairs - a)
+            total, apart = self._paired(total, chosen, a, count)
+            difference = apart.numpy().reshape(3, count, m)
+            for k in range(count):
+                means = self.samples.pixel_means(difference[:, k])
+                squares[a + k] = np.square(means, dtype=np.float64).sum()
+            done(2 * count)
+        self.evaluated += 2 * m * pairs
+        found = np.ascontiguousarray(total.numpy().T)
+        self._check_sum(found, np.unique(ids))
+        return found, squares
+
     def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
         """All columns at some rows, projected as soon as they are known ([HPB07] 4).
 
@@ -303,6 +338,26 @@ class Elements:
             k += 1
         dr.eval(found)
         return found
+
+    @dr.syntax
+    def _paired(
+        self, total: mi.Color3f, chosen: _Chosen, first: int, count: int
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """Means of pairs of columns added up, and their differences (count * m)."""
+        m = len(self.samples)
+        lane = dr.arange(mi.UInt32, m)
+        at, start = self.samples.receivers(lane), chosen.start(lane) + dr.opaque(mi.UInt32, 2 * first)
+        total, apart = mi.Color3f(total), dr.zeros(mi.Color3f, m * count)
+        k, last, before = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 2 * count), mi.Color3f(0)
+        while k < last:
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
+            value = dr.gather(mi.Color3f, chosen.weights, start + k) * self.element(at, light, mi.Mask(True))
+            total += 0.5 * value
+            dr.scatter(apart, before - value, (k >> 1) * m + lane, (k & 1) == 1)
+            before = mi.Color3f(value)
+            k += 1
+        dr.eval(total, apart)
+        return total, apart
 
     @dr.syntax
     def _norms(

@@ -235,14 +235,11 @@ def sum_with_error(
     twice = np.flatnonzero(_systematic(chance, rng))
     once = np.setdiff1d(np.arange(len(chance)), twice)
     values = elements.sum_columns(first.ids[:, once], first.weights[:, once], done, local.slices)
-    squared = 0.0
     ids = np.stack([first.ids[:, twice], second.ids[:, twice]], axis=2).reshape(len(ordered), -1)
     weights = np.stack([first.weights[:, twice], second.weights[:, twice]], axis=2)
-    columns = elements.each_column(ids, weights.reshape(len(ordered), -1, 3), done, local.slices)
-    for k, x, y in zip(twice, columns, columns, strict=False):
-        values += (x + y) / 2
-        variance = float(np.square(elements.samples.pixel_means(x - y), dtype=np.float64).sum()) / 2
-        squared += variance * (1 / chance[k] - 1 / 2)
+    means, squares = elements.sum_pairs(ids, weights.reshape(len(ordered), -1, 3), done, local.slices)
+    squared = float((squares / 2 * (1 / chance[twice] - 1 / 2)).sum())
+    values += means
     return Estimate(values, squared if len(twice) else (0.0 if not chance.any() else float("nan")))
 
 

@@ -161,8 +161,8 @@ class Samples:
         return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
     def pixel_means(self, values: Floats) -> Floats:
-        """Means (pixels, 3) of what rows add to their pixels, (m, 3); of those pixels that have rows."""
-        sums: Floats = np.add.reduceat(values, self._first_rows, axis=0, dtype=np.float32)
+        """Means (channels, pixels) of what rows add to their pixels, (channels, m); of those pixels that have rows."""
+        sums: Floats = np.add.reduceat(values, self._first_rows, axis=1, dtype=np.float32)
         return sums / np.float32(self.spp)
 
     @cached_property

@@ -124,16 +124,20 @@ def split_clusters(
     new = len(clusters)
     while len(found) < count:
         _, dearest = heapq.heappop(heap)
-        for members in split_cluster(x, norms, found.pop(dearest), rng):
+        pieces, costs = _cut(x, norms, found.pop(dearest), rng)
+        for members, cost in zip(pieces, costs, strict=True):
             found[new] = members
-            heapq.heappush(heap, (-cluster_cost(x[members], norms[members]), new))
+            heapq.heappush(heap, (-cost if len(members) > 1 else 1.0, new))
             new += 1
     return list(found.values())
 
 
 def cluster_cost(x: Columns, norms: Doubles) -> float:
     """Cost of a cluster of columns (n, r), the sum over its pairs; -1 where there is nothing to split."""
-    return float(costs_of_first(x, norms)[-1]) if len(x) > 1 else -1.0
+    if len(x) < 2:
+        return -1.0
+    total = x.sum(axis=0, dtype=np.float64)
+    return max(float(norms.sum() ** 2 - total @ total), 0.0)
 
 
 def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
@@ -145,12 +149,20 @@ def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
 
 def split_cluster(x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
     """A cluster of two or more, cut at the best place along a random line of directions."""
-    along = x[members] @ rng.normal(size=x.shape[1])
-    np.divide(
-        along, norms[members], out=along, where=norms[members] > 0
-    )  # where some are zero, for all that matters
-    ordered = members[np.argsort(along, kind="stable")]
-    before = costs_of_first(x[ordered], norms[ordered])[:-1]
-    after = costs_of_first(x[ordered[::-1]], norms[ordered[::-1]])[:-1][::-1]
-    cut = 1 + int(np.argmin(before + after))
-    return ordered[:cut], ordered[cut:]
+    return _cut(x, norms, members, rng)[0]
+
+
+def _cut(
+    x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator
+) -> tuple[tuple[Ids, Ids], tuple[float, float]]:
+    """``split_cluster``, and the costs of both pieces."""
+    own, lengths = x[members], norms[members]
+    along = own @ rng.normal(size=(x.shape[1],)).astype(x.dtype)
+    np.divide(along, lengths, out=along, where=lengths > 0)  # where some are zero, for all that matters
+    order = np.argsort(along, kind="stable")
+    own, lengths = own[order], lengths[order]
+    before = costs_of_first(own, lengths)[:-1]
+    after = costs_of_first(own[::-1], lengths[::-1])[:-1][::-1]
+    best = int(np.argmin(before + after))
+    ordered = members[order]
+    return (ordered[: best + 1], ordered[best + 1 :]), (float(before[best]), float(after[best]))

@@ -97,6 +97,20 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
     assert matrix.sum_columns(columns, weights) == pytest.approx(expected, rel=1e-5, abs=1e-7)
     for each, column, weight in zip(matrix.each_column(columns, weights), columns, weights, strict=True):
         assert each == pytest.approx(whole[:, column] * weight, rel=1e-5, abs=1e-7)
+    ids, twos = np.array([columns, columns[::-1]]), np.array([weights, weights[::-1]])
+    slices = (np.arange(len(matrix.samples)) > 100).astype(np.int64)
+    sums, squares = matrix.sum_pairs(ids, twos, slices=slices)
+    assert sums == pytest.approx(expected / 2, rel=1e-5, abs=1e-7)
+    signs = np.where(slices, -1, 1)[:, None]
+    pixel = matrix.samples.ids // 4
+    for k, (i, j) in enumerate(((0, 1), (2, 3))):
+        apart = [
+            (whole[:, columns[a]] * weights[a] - whole[:, columns[b]] * weights[b]) * signs
+            for a, b in ((i, j), (3 - i, 3 - j))
+        ]
+        means = np.zeros((256, 3))
+        np.add.at(means, pixel, np.where(slices[:, None] > 0, -apart[1], apart[0]) / 4)
+        assert squares[k] == pytest.approx((means**2).sum(), rel=1e-4)
     assert matrix.sum_of_rows(10, 30) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
 
 
@@ -223,16 +237,18 @@ def test_the_predicted_error_is_that_of_the_image(matrix: Elements, whole: np.nd
         assert len(local.partitions) > 1 and {len(p) for p in local.partitions} == {60}
     columns = whole.astype(np.float32)
 
-    def sum_columns(ids, weights, done, slices):
-        return sum(each_column(ids, weights, done, slices), np.zeros_like(columns[:, 0]))
-
-    def each_column(ids, weights, done, slices):
+    def each(ids, weights, slices):
         for k in range(ids.shape[1]):
             yield columns[np.arange(len(columns)), ids[slices, k]] * weights[slices, k]
 
-    twin = SimpleNamespace(
-        sum_columns=sum_columns, each_column=each_column, samples=SimpleNamespace(pixel_means=lambda v: v)
-    )
+    def sum_columns(ids, weights, done, slices):
+        return sum(each(ids, weights, slices), np.zeros_like(columns[:, 0]))
+
+    def sum_pairs(ids, weights, done, slices):
+        every = np.array(list(each(ids, weights, slices)))
+        return every.sum(axis=0) / 2, ((every[::2] - every[1::2]) ** 2).sum(axis=(1, 2))
+
+    twin = SimpleNamespace(sum_columns=sum_columns, sum_pairs=sum_pairs)
     predicted, true, sums = np.zeros(200), np.zeros(200), np.zeros(200)
     for k in range(200):
         found = sum_with_error(twin, local, np.random.default_rng(k))
