@@ -51,6 +51,15 @@ class ReducedColumns(NamedTuple):
     kept: NDArray[np.float16]
     scales: Floats
 
+    def of_lights(self, ids: Ids) -> ReducedColumns:
+        """The columns of some lights."""
+        return self._replace(
+            projected=self.projected[ids],
+            norms=self.norms[ids],
+            channel_norms=self.channel_norms[ids],
+            kept=self.kept[:, ids],
+        )
+
 
 class _Chosen(NamedTuple):
     """Columns and their weights on the device, slice after slice, and where the columns of each sample begin."""

@@ -40,6 +40,12 @@ class Partition:
     def __len__(self) -> int:
         return len(self.clusters)
 
+    def numbered(self, ids: Ids, lights: int) -> Partition:
+        """Of some of ``lights`` columns, by their numbers among all."""
+        drawing = np.zeros(lights)
+        drawing[ids] = self.drawing
+        return Partition([ids[own] for own in self.clusters], drawing, self.costs)
+
 
 class Representatives(NamedTuple):
     """A column of each cluster: (c,) int64, and what it is multiplied with: (c, 3) float32."""
@@ -125,6 +131,12 @@ class LocalPartitions:
 
     def __len__(self) -> int:
         return max(map(len, self.partitions), default=0)
+
+    def numbered(self, ids: Ids, lights: int) -> LocalPartitions:
+        """See ``Partition``."""
+        return LocalPartitions(
+            self.slices, [partition.numbered(ids, lights) for partition in self.partitions]
+        )
 
 
 def refined(

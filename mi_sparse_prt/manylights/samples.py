@@ -131,9 +131,9 @@ class Samples:
         found = (w.name for w in placed_shapes(self._scene) if dr.all(met == mi.ShapePtr(w.shape)))
         return f"shape '{next(found, 'of an instance')}' (pixel {x}, {y})"
 
-    def image(self, values: Floats) -> Floats:
+    def image(self, values: Floats, visible: bool = True) -> Floats:
         """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
-        every = self.seen.copy()
+        every = self.seen.copy() if visible else np.zeros_like(self.seen)
         every[self.ids] += values
         return self.filtered(every)
 
