@@ -46,7 +46,8 @@ _PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
 
 PILOT = 16  # rows, and columns, that tell what others cost
 CLUSTERING = 7e-9  # seconds for each light and cluster
-ROWS_PER_SLICE = 16  # at which samples are apart in slices, with clusters of their own
+ROWS_PER_SLICE = 16  # at least, where samples are apart in slices, with clusters of their own
+SLICES = 20  # at most
 GLOBAL = 0.6  # of the clusters are found for all samples
 EARLY = 9  # times fewer columns for a preview
 RESERVE = 0.05  # of a time budget
@@ -302,7 +303,7 @@ class RowColumn:
         rng = self.settings.random(_CLUSTER)
         if self.settings.method == "hasan2007":
             return published_partition(reduced, columns, rng)
-        slices = len(reduced.rows) // ROWS_PER_SLICE
+        slices = min(len(reduced.rows) // ROWS_PER_SLICE, SLICES)
         globally = columns if slices < 2 else max(1, round(GLOBAL * columns))
         partition = defensive_partition(reduced, flux, globally, rng)
         if slices < 2:

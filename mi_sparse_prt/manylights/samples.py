@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -188,7 +189,11 @@ class Samples:
             Of each slice, the rows that tell most about it, by their places in ``rows``: at least ``LEAST_ROWS``.
         """
         features = self._features(radius)
-        centres, label = kmeans2(features[rows], count, minit="++", rng=0, missing="warn", iter=10)
+        own = features[rows]
+        start = own[np.random.default_rng([len(rows), _CAMERA]).choice(len(rows), count, replace=False)]
+        with warnings.catch_warnings():  # an empty slice is left out
+            warnings.simplefilter("ignore", UserWarning)
+            centres, label = kmeans2(own, start, minit="matrix")
         centres = centres[np.unique(label)]
         nearest = np.concatenate(
             [
@@ -196,12 +201,12 @@ class Samples:
                 for part in np.array_split(features, max(1, len(features) >> 16))
             ]
         )
-        away = _squared_distances(features[rows], centres)
-        own = away.argmin(axis=1)
+        away = _squared_distances(own, centres)
+        nearest_of_row = away.argmin(axis=1)
         rows_of = []
         for k in range(len(centres)):
             order = np.argsort(away[:, k], kind="stable")
-            rows_of.append(np.union1d(np.flatnonzero(own == k), order[:LEAST_ROWS]))
+            rows_of.append(np.union1d(np.flatnonzero(nearest_of_row == k), order[:LEAST_ROWS]))
         return nearest, rows_of
 
     def _features(self, radius: float) -> Floats:
