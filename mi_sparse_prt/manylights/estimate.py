@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedColumns
-from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_cost, split_clusters, with_lengths
+from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_costs, split_clusters, with_lengths
 
 DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
 UNSEEN = 0.1  # of the clusters, at most, are for columns that no row sees
@@ -172,8 +172,7 @@ def refined(
         drawing[unseen] = partition.drawing[unseen]
         drawing = drawing if norms.any() else partition.drawing
         clusters = split_clusters(np.ascontiguousarray(x), norms, partition.clusters, count, rng)
-        costs = np.array([max(cluster_cost(x[ids], norms[ids]), 0) for ids in clusters])
-        found.append(Partition(clusters, drawing, costs))
+        found.append(Partition(clusters, drawing, cluster_costs(x, norms, clusters)))
     return LocalPartitions(slices, found)
 
 
@@ -183,8 +182,7 @@ def _partition(
     norms = reduced.norms[ids]
     x = with_lengths(reduced.projected[ids], norms)
     clusters = cluster_columns(x, norms, count, rng)
-    costs = np.array([max(cluster_cost(x[own], norms[own]), 0) for own in clusters])
-    return Partition([ids[own] for own in clusters], drawing, costs)
+    return Partition([ids[own] for own in clusters], drawing, cluster_costs(x, norms, clusters))
 
 
 def draw_representatives(partition: Partition, rng: np.random.Generator) -> Representatives:

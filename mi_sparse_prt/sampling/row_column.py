@@ -118,7 +118,8 @@ def split_clusters(
     x: Columns, norms: Doubles, clusters: list[Ids], count: int, rng: np.random.Generator
 ) -> list[Ids]:
     """Split the dearest cluster until there are ``count``, or as many as columns."""
-    heap = [(-cluster_cost(x[members], norms[members]), k) for k, members in enumerate(clusters)]
+    known = cluster_costs(x, norms, clusters)
+    heap = [(-cost if len(clusters[k]) > 1 else 1.0, k) for k, cost in enumerate(known.tolist())]
     found, count = dict(enumerate(clusters)), min(count, sum(map(len, clusters)))
     heapq.heapify(heap)
     new = len(clusters)
@@ -132,12 +133,16 @@ def split_clusters(
     return list(found.values())
 
 
-def cluster_cost(x: Columns, norms: Doubles) -> float:
-    """Cost of a cluster of columns (n, r), the sum over its pairs; -1 where there is nothing to split."""
-    if len(x) < 2:
-        return -1.0
-    total = x.sum(axis=0, dtype=np.float64)
-    return max(float(norms.sum() ** 2 - total @ total), 0.0)
+def cluster_costs(x: Columns, norms: Doubles, clusters: list[Ids]) -> Doubles:
+    """Costs (c,) of clusters, none of which is empty: of each, the sum over its pairs."""
+    if not clusters:
+        return np.zeros(0)
+    order, sizes = np.concatenate(clusters), [len(members) for members in clusters]
+    first = np.cumsum([0, *sizes[:-1]])
+    sums = np.add.reduceat(x[order], first, axis=0, dtype=np.float64)
+    lengths = np.add.reduceat(norms[order], first, dtype=np.float64)
+    found: Doubles = np.maximum(lengths**2 - (sums**2).sum(axis=1), 0)
+    return found
 
 
 def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
