@@ -499,6 +499,26 @@ def test_the_integrator_complains_when_it_is_made() -> None:
         mi.load_dict({"type": "row_column", "rows": -1})
 
 
+def test_the_integrator_refuses_to_be_inside_of_another(small_room: mi.Scene) -> None:
+    around = {"type": "aov", "aovs": "d:depth", "inner": {"type": "row_column", "lights": 100}}
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(small_room, integrator=mi.load_dict(around), spp=1)
+    assert "row_column makes whole pictures" in f"{caught.value} {caught.value.__cause__}"
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.PrtWarning")
+def test_scenes_come_as_files_and_as_this_package_loads_them() -> None:
+    """Expected: the same image of the same file; of shapes as this package has them within 10%, by other samples."""
+    path = "scenes_xml/many_lights/hall.xml"
+    size, asked = {"width": 16, "height": 12}, {**SMALL, "lights": 1000, "rows": 60, "columns": 300}
+    first, again = (mi.load_file(path, optimize=False, **size) for _ in range(2))
+    image = prt.render_many_lights(first, **asked).image
+    assert np.array_equal(image, prt.render_many_lights(again, **asked).image)
+    other = prt.render_many_lights(prt.load_scene(path, float("inf"), **size), **asked).image
+    assert other.mean() == pytest.approx(image.mean(), rel=0.1)
+    assert prt.render_many_lights(path, spp=1, **SMALL).image.shape == (300, 400, 3)
+
+
 def test_a_time_budget_chooses_rows_and_columns(small_room: mi.Scene) -> None:
     early = []
     found = prt.render_many_lights(
