@@ -27,6 +27,7 @@ SIZES = 100, 400, 1200  # rows and columns together
 SETTINGS = (100, 100), (300, 900)  # of [HPB07] Table 2
 LIGHTS = 100, 500, 2500  # of the baselines
 PATH_SPP = 1, 4, 16, 64
+COUNT = 100_000  # lights in all
 SEEDS = 2
 ALL_LIGHTS_SHARE = 0.01  # of the columns tell how long all take
 SINGULAR = 1200, 1001  # samples and lights whose singular values are drawn ([HPB07] Figure 3)
@@ -37,8 +38,8 @@ def measure_many_lights(
     parameters: dict[str, str],
     progress: bool = True,
     figures: Path | None = None,
-    seeds: int = SEEDS,
-    settings: Settings = Settings(),  # noqa: B008
+    seeds: int | None = None,
+    settings: Settings | None = None,
 ) -> dict[str, Any]:
     """Time and error of both methods, at four ratios of rows to columns, and of the baselines, on one scene.
 
@@ -57,7 +58,8 @@ def measure_many_lights(
     seeds : int
         Runs of each point.
     settings : Settings
-        Lights, samples per pixel and depth; rows and columns are chosen here.
+        Lights, samples per pixel and depth, those of ``render_many_lights`` if not given; rows and columns are chosen
+        here.
 
     Returns
     -------
@@ -66,13 +68,13 @@ def measure_many_lights(
         with ``seconds``, mean ``error`` and its ``spread`` over seeds, and ``predicted`` where it is known; ``table``
         (as [HPB07] Table 2), ``singular_values``, ``path``. JSON as it is.
     """
-    scene = load_mitsuba(path, **parameters)
+    scene, settings = load_mitsuba(path, **parameters), settings or Settings(lights=COUNT)
     run = Run(settings.seed, progress=progress)
     elements = matrix_of(find_view(scene, 0), settings, run)
     m, n = elements.shape
     with kept_memory(), tempfile.TemporaryDirectory() as scratch:
         reference = elements.samples.image(all_lights(elements, run, figures or Path(scratch)))
-        bench = _Bench(elements, settings, reference, seeds)
+        bench = _Bench(elements, settings, reference, seeds or SEEDS)
         bench.warm_up()
         report: dict[str, Any] = {
             "machine": describe_machine(),

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import mi_sparse_prt as prt
 from mi_sparse_prt.cli import options
 from mi_sparse_prt.cli.running import running
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class ManyLightsMethod(StrEnum):
@@ -56,6 +61,12 @@ Clamp = Annotated[
 ]
 Camera = Annotated[int, typer.Option(help="Which of the scene's sensors.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same image.")]
+Groups = Annotated[
+    bool,
+    typer.Option(
+        "--groups", help="Light of each emitter apart: the .exr file has a layer for each, named after it."
+    ),
+]
 Preview = Annotated[
     bool,
     typer.Option(
@@ -78,6 +89,7 @@ def many_lights(
     clamp: Clamp = None,
     camera: Camera = 0,
     seed: Seed = 0,
+    groups: Groups = False,
     preview: Preview = False,
     exposure: Exposure = 0.0,
     define: options.Define = None,
@@ -93,39 +105,38 @@ def many_lights(
     """
     if output.suffix.lower() not in (".exr", ".png"):
         raise typer.BadParameter(f"{output}: give a name that ends in .exr or .png", param_hint="-o")
+    if groups and output.suffix.lower() == ".png":
+        raise typer.BadParameter("layers need an .exr file: give -o FILE.exr", param_hint="--groups")
     with running(json_file, quiet, outputs=[output]) as command:
-        from mi_sparse_prt.cli.files import image_bytes
+        from mi_sparse_prt.cli.files import image_bytes, layers_bytes
         from mi_sparse_prt.cli.tables.many_lights import many_lights_table
-        from mi_sparse_prt.manylights.elements import Floats
-        from mi_sparse_prt.manylights.render import render_many_lights
         from mi_sparse_prt.scene.loading import load_mitsuba
 
-        def write(image: Floats) -> None:
+        def write(image: NDArray[np.float32]) -> None:
             command.write(output, image_bytes(image, output.suffix.lower(), exposure))
 
         loaded = load_mitsuba(scene, **options.definitions(define))
-        with command.patient_interrupts() as let_interrupt:
-
-            def early(image: Floats) -> None:
-                write(image)
-                let_interrupt()
-
-            found = render_many_lights(
+        # an early picture is written while the work goes on, and must not be cut off
+        with command.patient_interrupts() if preview else command.prompt_interrupts():
+            found = prt.render_many_lights(
                 loaded,
                 rows,
                 columns,
                 seconds,
                 sensor=camera,
                 progress=not quiet,
-                preview=early if preview else None,
+                preview=write if preview else None,
                 method=method.value,
                 lights=lights,
                 spp=spp,
                 max_depth=max_depth,
                 clamp=clamp,
                 seed=seed,
+                groups=groups,
             )
-            let_interrupt()
+        if groups:
+            command.write(output, layers_bytes(found.image, found.layers))
+        else:
             write(found.image)
         command.report = {"scene": str(scene), "image": str(output), **found.report}
         command.show(many_lights_table(str(scene), found.report))

@@ -36,11 +36,41 @@ class ReducedColumns(NamedTuple):
         Of the columns before that.
     channel_norms : (n, 3) float64
         Of each channel.
+    rows : (r,) int64
+        Which rows these are.
+    kept : (r, n) float16
+        2-norms of RGB, relative to the largest of their row.
+    scales : (r,) float32
+        The largest of each row.
     """
 
     projected: Floats
     norms: NDArray[np.float64]
     channel_norms: NDArray[np.float64]
+    rows: NDArray[np.int64]
+    kept: NDArray[np.float16]
+    scales: Floats
+
+    def of_lights(self, ids: Ids) -> ReducedColumns:
+        """The columns of some lights."""
+        return self._replace(
+            projected=self.projected[ids],
+            norms=self.norms[ids],
+            channel_norms=self.channel_norms[ids],
+            kept=self.kept[:, ids],
+        )
+
+
+class _Chosen(NamedTuple):
+    """Columns and their weights on the device, slice after slice, and where the columns of each sample begin."""
+
+    columns: mi.UInt32
+    weights: mi.Color3f
+    starts: mi.UInt32 | None
+
+    def start(self, samples: mi.UInt32) -> mi.UInt32:
+        """Of samples."""
+        return mi.UInt32(0) if self.starts is None else dr.gather(mi.UInt32, self.starts, samples)
 
 
 class Elements:
@@ -97,62 +127,101 @@ class Elements:
         """Whole columns (m, len(ids), 3)."""
         return self.block(np.arange(self.shape[0]), ids)
 
-    def sum_columns(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Floats:
+    def sum_columns(
+        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
+    ) -> Floats:
         """Sums (m, 3) of columns, each times its colour, without keeping any.
 
         Parameters
         ----------
-        ids : (k,) integers
-        weights : (k, 3) float32
+        ids : (k,) or (n_slices, k) integers
+            Columns, of each slice of samples its own ones.
+        weights : (k, 3) or (n_slices, k, 3) float32
         done : callable
+        slices : (m,) integers, optional
+            To which slice each sample belongs.
 
         Raises
         ------
         PrtError
             An element is not finite: sample and light are named.
         """
-        m, total = len(self.samples), dr.zeros(mi.Color3f, len(self.samples))
-        if not m or not len(ids):
+        m, count = len(self.samples), np.shape(ids)[-1]
+        total = dr.zeros(mi.Color3f, m)
+        if not m or not count:
             return np.zeros((m, 3), np.float32)
-        column, factor, lane = (
-            mi.UInt32(np.asarray(ids, np.uint32)),
-            _colours(weights),
-            dr.arange(mi.UInt32, m),
-        )
-        for first, count in _pieces(len(ids), max(1, LANES // m)):
-            total = self._accumulated(total, lane, column, factor, first, count)
+        chosen, lane = _chosen(ids, weights, slices, m), dr.arange(mi.UInt32, m)
+        for first, size in _pieces(count, max(1, LANES // m)):
+            total = self._accumulated(total, lane, chosen, first, size)
             dr.eval(total)
-            done(count)
-        self.evaluated += m * len(ids)
+            done(size)
+        self.evaluated += m * count
         found = np.ascontiguousarray(total.numpy().T)
-        self._check_sum(found, ids)
+        self._check_sum(found, np.unique(ids))
         return found
 
     def sum_of_rows(self, first: int, count: int) -> Floats:
         """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
         n = len(self.lights)
         lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        column, factor = dr.arange(mi.UInt32, n), dr.full(mi.Color3f, 1, n)
+        chosen = _chosen(np.arange(n), np.ones((n, 3), np.float32), None, count)
         found = np.zeros((count, 3))
         for start, size in _pieces(n, max(1, LANES // max(count, 1))):
-            part = self._accumulated(dr.zeros(mi.Color3f, count), lane, column, factor, start, size)
+            part = self._accumulated(dr.zeros(mi.Color3f, count), lane, chosen, start, size)
             found += part.numpy().T
         self.evaluated += n * count
         self._check_sum(found.astype(np.float32), np.arange(n), first)
         return found.astype(np.float32)
 
-    def each_column(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Iterator[Floats]:
+    def each_column(
+        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
+    ) -> Iterator[Floats]:
         """The columns (m, 3) that ``sum_columns`` adds up, one after the other."""
-        m = len(self.samples)
-        column, factor = mi.UInt32(np.asarray(ids, np.uint32)), _colours(weights)
-        for first, count in _pieces(len(ids), max(1, LANES // max(m, 1))):
-            found = self._kept(column, factor, first, count).numpy().reshape(3, count, m)
+        m, total = len(self.samples), np.shape(ids)[-1]
+        chosen = _chosen(ids, weights, slices, m)
+        for first, count in _pieces(total, max(1, LANES // max(m, 1))):
+            found = self._kept(chosen, first, count).numpy().reshape(3, count, m)
             self.evaluated += m * count
             done(count)
             for k in range(count):
                 values = np.ascontiguousarray(found[:, k].T)
-                self._check_sum(values, ids)
+                self._check_sum(values, np.unique(ids))
                 yield values
+
+    def sum_pairs(
+        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
+    ) -> tuple[Floats, NDArray[np.float64]]:
+        """Sums of the means of pairs of columns (m, 3), and how far apart those of each pair are.
+
+        Parameters
+        ----------
+        ids : (n_slices, 2 k) integers
+            Both columns of a pair follow each other.
+        weights : (n_slices, 2 k, 3) float32
+        done, slices
+            As for ``sum_columns``.
+
+        Returns
+        -------
+        sums : (m, 3) float32
+        squares : (k,) float64
+            Of the differences, as the means of pixels have them, over pixels and channels.
+        """
+        m, pairs = len(self.samples), np.shape(ids)[-1] // 2
+        chosen, total = _chosen(ids, weights, slices, m), dr.zeros(mi.Color3f, m)
+        squares = np.zeros(pairs)
+        for a in range(0, pairs, step := max(1, LANES // m)):
+            count = min(step, pairs - a)
+            total, apart = self._paired(total, chosen, a, count)
+            difference = apart.numpy().reshape(3, count, m)
+            for k in range(count):
+                means = self.samples.pixel_means(difference[:, k])
+                squares[a + k] = np.square(means, dtype=np.float64).sum()
+            done(2 * count)
+        self.evaluated += 2 * m * pairs
+        found = np.ascontiguousarray(total.numpy().T)
+        self._check_sum(found, np.unique(ids))
+        return found, squares
 
     def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
         """All columns at some rows, projected as soon as they are known ([HPB07] 4).
@@ -170,6 +239,7 @@ class Elements:
         """
         n = len(self.lights)
         projected = np.zeros((n, projection.shape[1]), np.float32)
+        kept, scales = np.zeros((len(rows), n), np.float16), np.zeros(len(rows), np.float32)
         squares = [dr.zeros(mi.Float, n) for _ in range(3)]
         if n and len(rows):
             receivers = self.samples.receivers(mi.UInt32(np.asarray(rows, np.uint32)))
@@ -178,15 +248,19 @@ class Elements:
         for a in range(0, len(rows) if n else 0, step):
             count = min(step, len(rows) - a)
             norms, squares = self._norms(receivers, a, count, squares)
-            block = norms.numpy().reshape(count, n)
+            block = norms.numpy().reshape(count, n).copy()
             self._check_rows(block, np.asarray(rows)[a : a + count])
             for b in range(0, count, ROWS):
                 own = slice(b, min(b + ROWS, count))
                 projected += block[own].T @ projection[a + own.start : a + own.stop]
+            scales[a : a + count] = block.max(axis=1)
+            np.divide(block, np.maximum(block.max(axis=1, keepdims=True), 1e-30), out=block)
+            kept[a : a + count] = block
             done(count)
         self.evaluated += n * len(rows)
         channels = np.stack([square.numpy() for square in squares], axis=1).astype(np.float64)
-        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels))
+        ids = np.asarray(rows, np.int64)
+        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels), ids, kept, scales)
 
     def element(self, at: Receivers, light: LightArrays, active: mi.Mask) -> mi.Color3f:
         """Radiance of one light at one sample in each lane."""
@@ -246,38 +320,53 @@ class Elements:
 
     @dr.syntax
     def _accumulated(
-        self,
-        total: mi.Color3f,
-        samples: mi.UInt32,
-        columns: mi.UInt32,
-        weights: mi.Color3f,
-        first: mi.UInt32,
-        count: int,
+        self, total: mi.Color3f, samples: mi.UInt32, chosen: _Chosen, first: mi.UInt32, count: int
     ) -> mi.Color3f:
         """A lane for each sample; the lights are a loop inside of the kernel."""
-        at = self.samples.receivers(samples)
+        at, start = self.samples.receivers(samples), chosen.start(samples)
         total, k, last = mi.Color3f(total), mi.UInt32(first), first + dr.opaque(mi.UInt32, count)
         while k < last:
-            light = self.lights.arrays.take(dr.gather(mi.UInt32, columns, k))
-            total += dr.gather(mi.Color3f, weights, k) * self.element(at, light, mi.Mask(True))
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
+            factor = dr.gather(mi.Color3f, chosen.weights, start + k)
+            total += factor * self.element(at, light, mi.Mask(True))
             k += 1
         return total
 
     @dr.syntax
-    def _kept(self, columns: mi.UInt32, weights: mi.Color3f, first: mi.UInt32, count: int) -> mi.Color3f:
+    def _kept(self, chosen: _Chosen, first: mi.UInt32, count: int) -> mi.Color3f:
         """The same, each light's values after those of the one before: (count * m)."""
         m = len(self.samples)
         lane = dr.arange(mi.UInt32, m)
-        at = self.samples.receivers(lane)
+        at, start = self.samples.receivers(lane), chosen.start(lane) + first
         found = dr.zeros(mi.Color3f, m * count)
         k, last = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, count)
         while k < last:
-            light = self.lights.arrays.take(dr.gather(mi.UInt32, columns, first + k))
-            factor = dr.gather(mi.Color3f, weights, first + k)
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
+            factor = dr.gather(mi.Color3f, chosen.weights, start + k)
             dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * m + lane)
             k += 1
         dr.eval(found)
         return found
+
+    @dr.syntax
+    def _paired(
+        self, total: mi.Color3f, chosen: _Chosen, first: int, count: int
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """Means of pairs of columns added up, and their differences (count * m)."""
+        m = len(self.samples)
+        lane = dr.arange(mi.UInt32, m)
+        at, start = self.samples.receivers(lane), chosen.start(lane) + dr.opaque(mi.UInt32, 2 * first)
+        total, apart = mi.Color3f(total), dr.zeros(mi.Color3f, m * count)
+        k, last, before = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 2 * count), mi.Color3f(0)
+        while k < last:
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
+            value = dr.gather(mi.Color3f, chosen.weights, start + k) * self.element(at, light, mi.Mask(True))
+            total += 0.5 * value
+            dr.scatter(apart, before - value, (k >> 1) * m + lane, (k & 1) == 1)
+            before = mi.Color3f(value)
+            k += 1
+        dr.eval(total, apart)
+        return total, apart
 
     @dr.syntax
     def _norms(
@@ -326,5 +415,8 @@ def _pieces(count: int, size: int) -> Iterator[tuple[mi.UInt32, int]]:
         yield dr.opaque(mi.UInt32, first), min(size, count - first)
 
 
-def _colours(values: Floats) -> mi.Color3f:
-    return mi.Color3f(np.ascontiguousarray(np.asarray(values, np.float32).T))
+def _chosen(ids: Ids, weights: Floats, slices: Ids | None, samples: int) -> _Chosen:
+    colours = np.ascontiguousarray(np.asarray(weights, np.float32).reshape(-1, 3).T)
+    starts = None if slices is None else mi.UInt32((slices * np.shape(ids)[-1]).astype(np.uint32))
+    assert slices is None or len(slices) == samples
+    return _Chosen(mi.UInt32(np.ravel(ids).astype(np.uint32)), mi.Color3f(colours), starts)

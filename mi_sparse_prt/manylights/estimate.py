@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedColumns
-from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_cost, with_lengths
+from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_costs, split_clusters, with_lengths
 
 DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
 UNSEEN = 0.1  # of the clusters, at most, are for columns that no row sees
@@ -39,6 +39,12 @@ class Partition:
 
     def __len__(self) -> int:
         return len(self.clusters)
+
+    def numbered(self, ids: Ids, lights: int) -> Partition:
+        """Of some of ``lights`` columns, by their numbers among all."""
+        drawing = np.zeros(lights)
+        drawing[ids] = self.drawing
+        return Partition([ids[own] for own in self.clusters], drawing, self.costs)
 
 
 class Representatives(NamedTuple):
@@ -109,14 +115,74 @@ def defensive_partition(
     return Partition([*found.clusters, *others], drawing, np.append(found.costs, np.zeros(len(others))))
 
 
+@dataclass(frozen=True)
+class LocalPartitions:
+    """Clusters of columns for each slice of samples (Ou and Pellacini: LightSlice, 2011), equally many of each.
+
+    Attributes
+    ----------
+    slices : (m,) int64
+        To which slice each sample belongs.
+    partitions : list of Partition
+    """
+
+    slices: Ids
+    partitions: list[Partition]
+
+    def __len__(self) -> int:
+        return max(map(len, self.partitions), default=0)
+
+    def numbered(self, ids: Ids, lights: int) -> LocalPartitions:
+        """See ``Partition``."""
+        return LocalPartitions(
+            self.slices, [partition.numbered(ids, lights) for partition in self.partitions]
+        )
+
+
+def refined(
+    partition: Partition,
+    reduced: ReducedColumns,
+    slices: Ids,
+    rows_of: list[Ids],
+    count: int,
+    rng: np.random.Generator,
+) -> LocalPartitions:
+    """Split clusters further for each slice of samples, those that cost most at the rows near it.
+
+    Parameters
+    ----------
+    partition : Partition
+        Of all samples.
+    reduced : ReducedColumns
+    slices : (m,) int64
+        To which slice each sample belongs.
+    rows_of : list of (k,) int64
+        Rows that tell about each slice, by their places among ``reduced.rows``.
+    count : int
+        Clusters of each slice.
+    rng : np.random.Generator
+    """
+    unseen = reduced.norms <= 0
+    found = []
+    for own in rows_of:
+        x = (reduced.kept[own].astype(np.float32) * reduced.scales[own, None]).T  # [light, row]
+        norms = np.linalg.norm(x, axis=1).astype(np.float64)
+        every = partition.drawing / max(partition.drawing[~unseen].sum(), 1e-300)
+        drawing = norms + DEFENSIVE * norms.sum() * (every + 1 / len(norms))
+        drawing[unseen] = partition.drawing[unseen]
+        drawing = drawing if norms.any() else partition.drawing
+        clusters = split_clusters(np.ascontiguousarray(x), norms, partition.clusters, count, rng)
+        found.append(Partition(clusters, drawing, cluster_costs(x, norms, clusters)))
+    return LocalPartitions(slices, found)
+
+
 def _partition(
     reduced: ReducedColumns, ids: Ids, drawing: Doubles, count: int, rng: np.random.Generator
 ) -> Partition:
     norms = reduced.norms[ids]
     x = with_lengths(reduced.projected[ids], norms)
     clusters = cluster_columns(x, norms, count, rng)
-    costs = np.array([max(cluster_cost(x[own], norms[own]), 0) for own in clusters])
-    return Partition([ids[own] for own in clusters], drawing, costs)
+    return Partition([ids[own] for own in clusters], drawing, cluster_costs(x, norms, clusters))
 
 
 def draw_representatives(partition: Partition, rng: np.random.Generator) -> Representatives:
@@ -157,7 +223,7 @@ def _drawn(partition: Partition, rng: np.random.Generator) -> tuple[Ids, Doubles
 
 
 def sum_with_error(
-    elements: Elements, partition: Partition, rng: np.random.Generator, done: Done = lambda _: None
+    elements: Elements, local: LocalPartitions, rng: np.random.Generator, done: Done = lambda _: None
 ) -> Estimate:
     """The sum of all columns by one representative of each cluster, two of some, which tell the expected error.
 
@@ -167,38 +233,63 @@ def sum_with_error(
     Parameters
     ----------
     elements : Elements
-    partition : Partition
+    local : LocalPartitions
+        The clusters of each slice, the dearest first: the k-th of all slices are one column.
     rng : np.random.Generator
     done : callable
         Is told how many columns more are done.
     """
-    first, second = draw_representatives(partition, rng), draw_representatives(partition, rng)
-    chance = _chances(partition)
+    ordered = [_dearest_first(partition) for partition in local.partitions]
+    first, second = _padded(ordered, rng), _padded(ordered, rng)
+    chance = _chances(ordered)
     twice = np.flatnonzero(_systematic(chance, rng))
-    once = np.setdiff1d(np.arange(len(partition)), twice)
-    values = elements.sum_columns(first.ids[once], first.weights[once], done)
-    squared = 0.0
-    ids = np.stack([first.ids[twice], second.ids[twice]], axis=1).ravel()
-    weights = np.stack([first.weights[twice], second.weights[twice]], axis=1).reshape(-1, 3)
-    columns = elements.each_column(ids, weights, done)
-    for k, x, y in zip(twice, columns, columns, strict=False):
-        values += (x + y) / 2
-        variance = float(np.square(elements.samples.pixel_means(x - y), dtype=np.float64).sum()) / 2
-        squared += variance * (1 / chance[k] - 1 / 2)
+    once = np.setdiff1d(np.arange(len(chance)), twice)
+    values = elements.sum_columns(first.ids[:, once], first.weights[:, once], done, local.slices)
+    ids = np.stack([first.ids[:, twice], second.ids[:, twice]], axis=2).reshape(len(ordered), -1)
+    weights = np.stack([first.weights[:, twice], second.weights[:, twice]], axis=2)
+    means, squares = elements.sum_pairs(ids, weights.reshape(len(ordered), -1, 3), done, local.slices)
+    squared = float((squares / 2 * (1 / chance[twice] - 1 / 2)).sum())
+    values += means
     return Estimate(values, squared if len(twice) else (0.0 if not chance.any() else float("nan")))
 
 
-def _chances(partition: Partition) -> Doubles:
-    """Of each cluster to have a second representative; 0 where there is but one light."""
+def everywhere(partition: Partition, samples: int) -> LocalPartitions:
+    """The same clusters for all samples."""
+    return LocalPartitions(np.zeros(samples, np.int64), [partition])
+
+
+def _dearest_first(partition: Partition) -> Partition:
+    order = np.argsort(-_sizes(partition), kind="stable")
+    return Partition([partition.clusters[k] for k in order], partition.drawing, partition.costs[order])
+
+
+def _padded(partitions: list[Partition], rng: np.random.Generator) -> Representatives:
+    """Representatives (slices, c) of all slices; where a slice has fewer clusters, columns that count nothing."""
+    found = [draw_representatives(partition, rng) for partition in partitions]
+    count = max(len(some.ids) for some in found)
+    ids, weights = np.zeros((len(found), count), np.int64), np.zeros((len(found), count, 3), np.float32)
+    for k, some in enumerate(found):
+        ids[k, : len(some.ids)], weights[k, : len(some.ids)] = some
+    return Representatives(ids, weights)
+
+
+def _sizes(partition: Partition) -> Doubles:
+    """How much clusters may be off, by their cost and by their energy; 0 of single lights."""
     several = np.array([len(own) > 1 for own in partition.clusters], bool)
     energy = np.array([partition.drawing[own].sum() for own in partition.clusters]) ** 2 * several
     cost = partition.costs * several
-    size = np.sqrt(cost / max(cost.sum(), 1e-300)) + np.sqrt(energy / max(energy.sum(), 1e-300))
-    wanted = min(max(SECOND * len(partition), 2), several.sum())
-    chance, total = np.zeros(len(partition)), size.sum()
-    if total > 0:
-        chance = np.minimum(size * (wanted / total), 1)
-    return chance
+    size: Doubles = np.sqrt(cost / max(cost.sum(), 1e-300)) + np.sqrt(energy / max(energy.sum(), 1e-300))
+    return size
+
+
+def _chances(partitions: list[Partition]) -> Doubles:
+    """Of each column of clusters to have second representatives; 0 where there is but one light in each."""
+    size = np.zeros(max(map(len, partitions)))
+    for partition in partitions:
+        size[: len(partition)] += _sizes(partition)
+    wanted = min(max(SECOND * len(size), 2), int((size > 0).sum()))
+    total = size.sum()
+    return np.minimum(size * (wanted / total), 1) if total > 0 else size
 
 
 def _systematic(chance: Doubles, rng: np.random.Generator) -> NDArray[np.bool_]:

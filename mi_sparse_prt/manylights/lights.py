@@ -106,7 +106,7 @@ class Lights:
         radius: float,
     ) -> None:
         self.arrays, self.group, self.names, self.clamp = arrays, group, tuple(names), clamp
-        self._radius = radius
+        self.radius = radius
         self.kinds = LightKinds(bool(dr.any(arrays.kind == EMITTER)) if len(group) else False, glossy)
 
     def __len__(self) -> int:
@@ -119,7 +119,7 @@ class Lights:
     @cached_property
     def flux(self) -> Doubles:
         """Radiant flux (n,) that each light sends out, mean of the channels; of a direction, into the scene."""
-        angle = {DIRECTION: np.pi * self._radius**2, COSINE: np.pi, EMITTER: 4 * np.pi, SURFACE: 1.0}
+        angle = {DIRECTION: np.pi * self.radius**2, COSINE: np.pi, EMITTER: 4 * np.pi, SURFACE: 1.0}
         scale = np.array([angle[kind] for kind in sorted(angle)])
         power = self.arrays.power.numpy().mean(axis=0, dtype=np.float64)
         return np.asarray(power * scale[self.arrays.kind.numpy()])

@@ -22,10 +22,13 @@ from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
     SECOND,
     Estimate,
+    LocalPartitions,
     Partition,
     defensive_partition,
     draw_coloured_representatives,
+    everywhere,
     published_partition,
+    refined,
     sum_with_error,
 )
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
@@ -43,9 +46,15 @@ _PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
 
 PILOT = 16  # rows, and columns, that tell what others cost
 CLUSTERING = 7e-9  # seconds for each light and cluster
+ROWS_PER_SLICE = 16  # at least, where samples are apart in slices, with clusters of their own
+SLICES = 20  # at most
+GLOBAL = 0.6  # of the clusters are found for all samples
 EARLY = 9  # times fewer columns for a preview
 RESERVE = 0.05  # of a time budget
 
+VISIBLE = "visible"  # the layer of emitters that the camera sees
+
+Clusters = Partition | LocalPartitions
 View = tuple[mi.Scene, mi.Sensor]
 
 
@@ -67,6 +76,9 @@ class ManyLightsImage:
         Linear RGB, of the film's crop window.
     alpha : (height, width) float32
         Share of each pixel that is covered by what the scene shows.
+    layers : dict of str to (height, width, 3) float32
+        Of ``groups``: what each emitter of the scene adds, by name, and ``visible``: emitters that are seen. Their sum
+        is the image. Under other colours and intensities of the emitters, it is another weighted sum.
     report : dict
         ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
         ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known),
@@ -75,6 +87,7 @@ class ManyLightsImage:
 
     image: Floats
     alpha: NDArray[np.float32]
+    layers: dict[str, Floats]
     report: dict[str, Any]
 
 
@@ -97,6 +110,7 @@ class Settings:
     max_depth: int = 5
     clamp: float | None = None
     seed: int = 0
+    groups: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -148,7 +162,8 @@ def render_many_lights(
     **settings
         ``method``: ``"adaptive"``, or ``"hasan2007"`` for the paper as published. ``spp``: samples per pixel (4).
         ``lights``: about how many (100,000). ``max_depth``: as for ``path`` (5). ``clamp``: see ``LightOptions``.
-        ``seed`` (0).
+        ``seed`` (0). ``groups``: no cluster has lights of two emitters, and the image comes in layers, one for each
+        (false).
 
     Returns
     -------
@@ -227,6 +242,7 @@ class RowColumn:
         self.elements, self.settings, self.run = elements, settings, run
         self.samples, self.lights = elements.samples, elements.lights
         self.rows, self.columns = settings.rows, settings.columns
+        self.layers: dict[str, Floats] = {}
 
     def costs(self) -> Costs:
         """What a row and a column take, from a few of them, and clustering for each column."""
@@ -264,21 +280,44 @@ class RowColumn:
         with self.run.clock.phase("rows"), self.run.bar(len(ids), "rows") as bar:
             return self.elements.reduce_columns(ids, projection, bar.update)
 
-    def partition(self, reduced: ReducedColumns, columns: int) -> Partition:
-        """Clusters by the method."""
-        rng = self.settings.random(_CLUSTER)
-        with self.run.clock.phase("clustering"):
-            if self.settings.method == "hasan2007":
-                return published_partition(reduced, columns, rng)
-            return defensive_partition(reduced, self.lights.flux, columns, rng)
+    def partition(
+        self, reduced: ReducedColumns, columns: int, ids: NDArray[np.int64] | None = None
+    ) -> Clusters:
+        """Clusters by the method; of ``adaptive``, a part of them is refined for slices of samples.
 
-    def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
+        Parameters
+        ----------
+        reduced : ReducedColumns
+        columns : int
+            Clusters.
+        ids : (k,) int64, optional
+            Lights that they are to have; all if not given.
+        """
+        with self.run.clock.phase("clustering"):
+            if ids is None:
+                return self._partition(reduced, columns, self.lights.flux)
+            found = self._partition(reduced.of_lights(ids), columns, self.lights.flux[ids])
+            return found.numbered(ids, len(self.lights))
+
+    def _partition(self, reduced: ReducedColumns, columns: int, flux: NDArray[np.float64]) -> Clusters:
+        rng = self.settings.random(_CLUSTER)
+        if self.settings.method == "hasan2007":
+            return published_partition(reduced, columns, rng)
+        slices = min(len(reduced.rows) // ROWS_PER_SLICE, SLICES)
+        globally = columns if slices < 2 else max(1, round(GLOBAL * columns))
+        partition = defensive_partition(reduced, flux, globally, rng)
+        if slices < 2:
+            return everywhere(partition, len(self.samples))
+        labels, rows_of = self.samples.slices(reduced.rows, slices, self.lights.radius)
+        return refined(partition, reduced, labels, rows_of, columns, rng)
+
+    def summed(self, reduced: ReducedColumns, partition: Clusters) -> Estimate:
         """The sum of all columns by those that represent their clusters."""
         rng = self.settings.random(_DRAW)
-        published = self.settings.method == "hasan2007"
+        published = isinstance(partition, Partition)
         total = len(partition) if published else round((1 + SECOND) * len(partition))
         with self.run.clock.phase("columns"), self.run.bar(total, "columns", " columns") as bar:
-            if published:
+            if isinstance(partition, Partition):
                 chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
             return sum_with_error(self.elements, partition, rng, bar.update)
@@ -297,9 +336,26 @@ class RowColumn:
         if preview is not None:
             rough = self.partition(reduced, -(-self.columns // EARLY))
             preview(self.samples.image(self.summed(reduced, rough).values))
+        self.rows = min(self.rows, len(self.samples))
+        if self.settings.groups:
+            return self._by_group(reduced)
         partition = self.partition(reduced, self.columns)
-        self.rows, self.columns = min(self.rows, len(self.samples)), len(partition)
+        self.columns = len(partition)
         return self.summed(reduced, partition)
+
+    def _by_group(self, reduced: ReducedColumns) -> Estimate:
+        """The light of each emitter apart, with as many columns as what rows see of it is worth."""
+        found, columns = [], 0
+        for group, name in enumerate(self.lights.names):
+            ids = np.flatnonzero(self.lights.group == group)
+            if len(ids):
+                share = reduced.norms[ids].sum() / max(reduced.norms.sum(), 1e-300)
+                partition = self.partition(reduced, max(1, round(share * self.columns)), ids)
+                found.append(self.summed(reduced, partition))
+                self.layers[name], columns = found[-1].values, columns + len(partition)
+        self.columns = columns
+        values = np.asarray(sum(one.values for one in found), np.float32)
+        return Estimate(values, sum(one.squared_error for one in found))
 
     def _announce(self, seconds: float) -> None:
         if self.run.progress:
@@ -315,7 +371,10 @@ class RowColumn:
             image = self.samples.image(estimate.values)
             covered = self.samples.covered.astype(np.float32)[:, None]
             alpha = self.samples.filtered(covered)[..., 0]
-        return ManyLightsImage(image, alpha, self._report(image, estimate.squared_error))
+            layers = {name: self.samples.image(v, visible=False) for name, v in self.layers.items()}
+            if layers:
+                layers[VISIBLE] = self.samples.filtered(self.samples.seen)
+        return ManyLightsImage(image, alpha, layers, self._report(image, estimate.squared_error))
 
     def _report(self, image: Floats, squared_error: float) -> dict[str, Any]:
         m, n = self.elements.shape

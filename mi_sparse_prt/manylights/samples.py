@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
@@ -22,7 +24,10 @@ LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
 BENT = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
 _CAMERA = 0x5A17  # key of random numbers
 
+LEAST_ROWS = 12  # of a slice of samples
+
 Floats = NDArray[np.float32]
+Ids = NDArray[np.int64]
 
 
 @dataclass
@@ -127,9 +132,9 @@ class Samples:
         found = (w.name for w in placed_shapes(self._scene) if dr.all(met == mi.ShapePtr(w.shape)))
         return f"shape '{next(found, 'of an instance')}' (pixel {x}, {y})"
 
-    def image(self, values: Floats) -> Floats:
+    def image(self, values: Floats, visible: bool = True) -> Floats:
         """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
-        every = self.seen.copy()
+        every = self.seen.copy() if visible else np.zeros_like(self.seen)
         every[self.ids] += values
         return self.filtered(every)
 
@@ -157,14 +162,58 @@ class Samples:
         return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
     def pixel_means(self, values: Floats) -> Floats:
-        """Means (pixels, 3) of what rows add to their pixels, (m, 3); of those pixels that have rows."""
-        sums: Floats = np.add.reduceat(values, self._first_rows, axis=0, dtype=np.float32)
+        """Means (channels, pixels) of what rows add to their pixels, (channels, m); of those pixels that have rows."""
+        sums: Floats = np.add.reduceat(values, self._first_rows, axis=1, dtype=np.float32)
         return sums / np.float32(self.spp)
 
     @cached_property
     def _first_rows(self) -> NDArray[np.int64]:
         """The first row of each pixel that has some."""
         return np.unique(self.ids // self.spp, return_index=True)[1]
+
+    def slices(self, rows: NDArray[np.integer], count: int, radius: float) -> tuple[Ids, list[Ids]]:
+        """Samples that lie near each other and face alike, in slices around some rows.
+
+        Parameters
+        ----------
+        rows : (r,) integers
+        count : int
+            Slices, at most.
+        radius : float
+            Of the scene: normals that are at right angles count as much as half of it.
+
+        Returns
+        -------
+        slices : (m,) int64
+        rows_of : list of (k,) int64
+            Of each slice, the rows that tell most about it, by their places in ``rows``: at least ``LEAST_ROWS``.
+        """
+        features = self._features(radius)
+        own = features[rows]
+        start = own[np.random.default_rng([len(rows), _CAMERA]).choice(len(rows), count, replace=False)]
+        with warnings.catch_warnings():  # an empty slice is left out
+            warnings.simplefilter("ignore", UserWarning)
+            centres, label = kmeans2(own, start, minit="matrix")
+        centres = centres[np.unique(label)]
+        nearest = np.concatenate(
+            [
+                _squared_distances(part, centres).argmin(axis=1)
+                for part in np.array_split(features, max(1, len(features) >> 16))
+            ]
+        )
+        away = _squared_distances(own, centres)
+        nearest_of_row = away.argmin(axis=1)
+        rows_of = []
+        for k in range(len(centres)):
+            order = np.argsort(away[:, k], kind="stable")
+            rows_of.append(np.union1d(np.flatnonzero(nearest_of_row == k), order[:LEAST_ROWS]))
+        return nearest, rows_of
+
+    def _features(self, radius: float) -> Floats:
+        si = self._hit.compute_surface_interaction(self._ray)
+        normal = dr.mulsign(mi.Vector3f(si.sh_frame.n), mi.Frame3f.cos_theta(si.wi))
+        found = np.concatenate([si.p.numpy() / radius, normal.numpy() * np.float32(0.25 * np.sqrt(2))])
+        return np.ascontiguousarray(found.T, np.float32)
 
     def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
         """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.
@@ -186,6 +235,11 @@ class Samples:
         u = np.random.default_rng([seed, _CAMERA]).random(count)
         at = ((np.arange(count) + u) * (len(self) / max(count, 1))).astype(np.int64)
         return order[np.minimum(at, len(self) - 1)]
+
+
+def _squared_distances(x: Floats, centres: Floats) -> Floats:
+    """(n, k), but for what depends on x alone."""
+    return (centres**2).sum(axis=1) - 2 * (x @ centres.T)
 
 
 def _camera_rays(sensor: mi.Sensor, places: Floats, seed: int) -> tuple[mi.Ray3f, mi.Color3f, mi.PCG32]:

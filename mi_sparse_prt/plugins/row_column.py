@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.manylights.render import ManyLightsImage, Settings, render_many_lights
 
 
@@ -68,7 +69,7 @@ class RowColumn(mi.SamplingIntegrator):
         self,
         scene: mi.Scene,
         sensor: int | mi.Sensor = 0,
-        seed: int = 0,
+        seed: int | mi.UInt32 = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
@@ -82,10 +83,24 @@ class RowColumn(mi.SamplingIntegrator):
         """
         camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         spp = spp or self._spp or int(camera.sampler().sample_count())
+        number = seed if isinstance(seed, int) else int(mi.UInt32(seed).numpy()[0])
         found = render_many_lights(
-            scene, sensor=camera, progress=self._progress, spp=spp, seed=int(seed), **self._settings
+            scene, sensor=camera, progress=self._progress, spp=spp, seed=number, **self._settings
         )
         return _developed(camera.film(), found, develop)
+
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Mask = True,
+    ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
+        """What integrators around this one ask for: it has no answer for single rays (PrtError)."""
+        raise PrtError(
+            "row_column makes whole pictures, and cannot be inside of another integrator: take aov alone"
+        )
 
     def to_string(self) -> str:
         return f"RowColumn[{self._settings}]"

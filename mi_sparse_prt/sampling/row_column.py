@@ -118,22 +118,31 @@ def split_clusters(
     x: Columns, norms: Doubles, clusters: list[Ids], count: int, rng: np.random.Generator
 ) -> list[Ids]:
     """Split the dearest cluster until there are ``count``, or as many as columns."""
-    heap = [(-cluster_cost(x[members], norms[members]), k) for k, members in enumerate(clusters)]
+    known = cluster_costs(x, norms, clusters)
+    heap = [(-cost if len(clusters[k]) > 1 else 1.0, k) for k, cost in enumerate(known.tolist())]
     found, count = dict(enumerate(clusters)), min(count, sum(map(len, clusters)))
     heapq.heapify(heap)
     new = len(clusters)
     while len(found) < count:
         _, dearest = heapq.heappop(heap)
-        for members in split_cluster(x, norms, found.pop(dearest), rng):
+        pieces, costs = _cut(x, norms, found.pop(dearest), rng)
+        for members, cost in zip(pieces, costs, strict=True):
             found[new] = members
-            heapq.heappush(heap, (-cluster_cost(x[members], norms[members]), new))
+            heapq.heappush(heap, (-cost if len(members) > 1 else 1.0, new))
             new += 1
     return list(found.values())
 
 
-def cluster_cost(x: Columns, norms: Doubles) -> float:
-    """Cost of a cluster of columns (n, r), the sum over its pairs; -1 where there is nothing to split."""
-    return float(costs_of_first(x, norms)[-1]) if len(x) > 1 else -1.0
+def cluster_costs(x: Columns, norms: Doubles, clusters: list[Ids]) -> Doubles:
+    """Costs (c,) of clusters, none of which is empty: of each, the sum over its pairs."""
+    if not clusters:
+        return np.zeros(0)
+    order, sizes = np.concatenate(clusters), [len(members) for members in clusters]
+    first = np.cumsum([0, *sizes[:-1]])
+    sums = np.add.reduceat(x[order], first, axis=0, dtype=np.float64)
+    lengths = np.add.reduceat(norms[order], first, dtype=np.float64)
+    found: Doubles = np.maximum(lengths**2 - (sums**2).sum(axis=1), 0)
+    return found
 
 
 def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
@@ -145,9 +154,20 @@ def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
 
 def split_cluster(x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
     """A cluster of two or more, cut at the best place along a random line of directions."""
-    along = x[members] @ rng.normal(size=x.shape[1]) / norms[members]
-    ordered = members[np.argsort(along, kind="stable")]
-    before = costs_of_first(x[ordered], norms[ordered])[:-1]
-    after = costs_of_first(x[ordered[::-1]], norms[ordered[::-1]])[:-1][::-1]
-    cut = 1 + int(np.argmin(before + after))
-    return ordered[:cut], ordered[cut:]
+    return _cut(x, norms, members, rng)[0]
+
+
+def _cut(
+    x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator
+) -> tuple[tuple[Ids, Ids], tuple[float, float]]:
+    """``split_cluster``, and the costs of both pieces."""
+    own, lengths = x[members], norms[members]
+    along = own @ rng.normal(size=(x.shape[1],)).astype(x.dtype)
+    np.divide(along, lengths, out=along, where=lengths > 0)  # where some are zero, for all that matters
+    order = np.argsort(along, kind="stable")
+    own, lengths = own[order], lengths[order]
+    before = costs_of_first(own, lengths)[:-1]
+    after = costs_of_first(own[::-1], lengths[::-1])[:-1][::-1]
+    best = int(np.argmin(before + after))
+    ordered = members[order]
+    return (ordered[: best + 1], ordered[best + 1 :]), (float(before[best]), float(after[best]))

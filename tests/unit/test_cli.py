@@ -464,7 +464,7 @@ def test_usage_errors(arguments):
 
 
 @pytest.mark.parametrize(
-    "command", ["precompute", "relight", "view", "validate", "info", "benchmark", "pictures"]
+    "command", ["precompute", "relight", "view", "validate", "info", "benchmark", "pictures", "many-lights"]
 )
 def test_help_teaches(command):
     text = call(command, "--help").stdout

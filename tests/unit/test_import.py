@@ -91,7 +91,8 @@ def command_line(*arguments: str, before: str = "", **environment: str) -> subpr
 
 
 @pytest.mark.parametrize(
-    "command", ["", "precompute", "relight", "view", "validate", "info", "benchmark", "pictures"]
+    "command",
+    ["", "precompute", "relight", "view", "validate", "info", "benchmark", "pictures", "many-lights"],
 )
 def test_help_imports_nothing_large(command):
     when_it_ends = f"import atexit, sys\natexit.register(lambda: {LOADED})"

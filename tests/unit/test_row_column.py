@@ -9,7 +9,7 @@ from mi_sparse_prt.sampling import row_column
 from mi_sparse_prt.sampling.row_column import (
     cluster_by_sampling,
     cluster_columns,
-    cluster_cost,
+    cluster_costs,
     costs_beside_all,
     nearest_centre,
     random_projection,
@@ -30,7 +30,7 @@ def distance(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def total_cost(x: np.ndarray, norms: np.ndarray, clusters: list) -> float:
-    return sum(max(cluster_cost(x[own], norms[own]), 0) for own in clusters)
+    return float(cluster_costs(x, norms, clusters).sum())
 
 
 def test_the_cost_of_a_clustering_is_the_expected_squared_error() -> None:
@@ -48,10 +48,16 @@ def test_the_cost_of_a_clustering_is_the_expected_squared_error() -> None:
 def test_the_distance_is_symmetric_not_negative_and_zero_for_parallel_columns() -> None:
     x, norms = columns(12)
     for i, j in itertools.combinations(range(12), 2):
-        pair = [cluster_cost(x[[a, b]], norms[[a, b]]) for a, b in ((i, j), (j, i))]
-        assert pair[0] == pytest.approx(2 * distance(x[i], x[j]), rel=1e-9) and pair[0] == pair[1] >= 0
+        pair = cluster_costs(x, norms, [np.array([i, j]), np.array([j, i])])
+        assert (
+            pair[0] == pytest.approx(2 * distance(x[i], x[j]), rel=1e-9)
+            and pair[0] == pytest.approx(pair[1], abs=1e-15)
+            and pair.min() >= 0
+        )
     parallel = np.outer([1.0, 2.0, 0.1], x[0])
-    assert cluster_cost(parallel, np.linalg.norm(parallel, axis=1)) == pytest.approx(0, abs=1e-12)
+    assert cluster_costs(parallel, np.linalg.norm(parallel, axis=1), [np.arange(3)]) == pytest.approx(
+        0, abs=1e-12
+    )
 
 
 def test_alpha_is_the_sum_of_distances() -> None:

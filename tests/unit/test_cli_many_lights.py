@@ -1,0 +1,106 @@
+"""``many-lights`` and ``benchmark --many-lights`` on a scene of a few shapes: what they write, say and refuse."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_cli import SCENE, assert_one_line_error, call, entries
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark import many_lights as benchmark
+
+SMALL = ["--lights", 200, "--rows", 8, "--columns", 16, "--max-depth", 3]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE.replace("</scene>", '<emitter type="point" id="bulb"/></scene>'))
+    return path
+
+
+def test_many_lights_writes_an_image_and_a_report(scene, tmp_path):
+    exr, png, report = tmp_path / "a.exr", tmp_path / "a.png", tmp_path / "a.json"
+    result = call("many-lights", scene, "-o", exr, *SMALL, "--seed", 3, "--json", report)
+    assert (
+        result.exit_code == 0
+        and "estimated error" in result.stdout
+        and "8 rows and 16 columns" in result.stderr
+    )
+    found = prt.render_many_lights(scene, 8, 16, lights=200, max_depth=3, seed=3)
+    assert np.array_equal(np.array(mi.Bitmap(str(exr))), found.image)
+    assert json.loads(report.read_text())["estimated_error"] == found.report["estimated_error"]
+    assert (
+        call("many-lights", scene, "-o", png, *SMALL, "--preview", "-q", "--method", "hasan2007").exit_code
+        == 0
+    )
+    assert np.array(mi.Bitmap(str(png))).shape == (8, 12, 3)
+
+
+def test_groups_are_layers_of_one_file(scene, tmp_path):
+    exr = tmp_path / "a.exr"
+    assert call("many-lights", scene, "-o", exr, *SMALL, "--groups", "-q").exit_code == 0
+    bitmap = mi.Bitmap(str(exr))
+    names = {field.name.partition(".")[0] for field in bitmap.struct_()}
+    assert {"bulb", "visible"} < names and bitmap.channel_count() == 3 + 3 * 3
+    values = np.array(bitmap)
+    every = {field.name: values[..., k] for k, field in enumerate(bitmap.struct_())}
+    red = sum(v for name, v in every.items() if name.endswith(".R"))
+    assert red == pytest.approx(every["R"], abs=1e-5)
+
+
+def test_a_time_budget_is_kept_about(scene, tmp_path):
+    report = tmp_path / "a.json"
+    arguments = ["--lights", 200, "--seconds", 1, "--json", report]
+    assert call("many-lights", scene, "-o", tmp_path / "a.png", *arguments).exit_code == 0
+    assert json.loads(report.read_text())["rows"] >= 16
+
+
+def test_many_lights_refuses_in_one_line(scene, tmp_path):
+    before = entries(tmp_path)
+    image = tmp_path / "x.exr"
+    assert_one_line_error(call("many-lights", tmp_path / "none.xml", "-o", image), "none.xml")
+    assert_one_line_error(call("many-lights", scene, "-o", image, "--rows", 0, "-q"), "rows is 0")
+    assert_one_line_error(call("many-lights", scene, "-o", image, "--camera", 2, "-q"), "no sensor 2")
+    assert_one_line_error(call("many-lights", scene, "-o", tmp_path / "no" / "x.exr"), "no")
+    assert call("many-lights", scene, "-o", tmp_path / "x.jpg").exit_code == 2
+    assert call("many-lights", scene, "-o", tmp_path / "x.png", "--groups").exit_code == 2
+    assert entries(tmp_path) == before
+
+
+def test_ctrl_c_writes_nothing(monkeypatch, scene, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(prt, "render_many_lights", interrupted)
+    before = entries(tmp_path)
+    result = call("many-lights", scene, "-o", tmp_path / "x.exr", *SMALL, "-q")
+    assert result.exit_code == 130 and "nothing was written" in result.stderr
+    assert entries(tmp_path) == before
+
+
+def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_path):
+    """Expected: every curve has points whose errors fall or are small, and JSON and figures are written.
+
+    Rationale: sizes are small ones; all that is different from a full run.
+    """
+    for name, value in {
+        "SIZES": (20, 60),
+        "SETTINGS": ((8, 16),),
+        "LIGHTS": (10, 40),
+        "PATH_SPP": (1, 64),
+        "SINGULAR": (20, 20),
+        "COUNT": 300,
+    }.items():
+        monkeypatch.setattr(benchmark, name, value)
+    report, figures = tmp_path / "b.json", tmp_path / "plots"
+    result = call("benchmark", scene, "--many-lights", "--figures", figures, "--json", report)
+    assert result.exit_code == 0 and "instant radiosity" in result.stdout
+    found = json.loads(report.read_text())
+    assert len(found["curves"]) == 10 and len(found["table"]) == 2
+    for points in found["curves"].values():
+        assert points[-1]["error"] < 0.5 and points[-1]["seconds"] > 0
+    assert found["singular_values"][0] == 1 and found["path"][0]["error"] > found["path"][-1]["error"]
+    names = {path.name for path in figures.iterdir()}
+    assert {"many_lights.png", "singular_values.png", "pictures.png"} <= names
