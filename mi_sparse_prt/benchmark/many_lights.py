@@ -86,18 +86,9 @@ def measure_many_lights(
                 "shapes": len(scene.shapes()),
             },
             "all_lights": bench.all_lights(),
-            "curves": {},
-            "table": [],
         }
-        with run.bar(2 * len(RATIOS) + 3, "curves", " curves") as bar:
-            for method in METHODS:
-                for name, ratio in RATIOS.items():
-                    report["curves"][f"{method} {name}"] = bench.curve(method, ratio)
-                    bar.update()
-            report["curves"]["instant radiosity"] = bench.baseline("instant radiosity")
-            report["curves"]["power sampling"] = bench.baseline("power sampling")
-            report["path"] = _path(scene, settings.max_depth)
-            bar.update(3)
+        report["curves"] = bench.curves(run)
+        report["path"] = _path(scene, settings.max_depth)
         report["table"] = [bench.row_of_table(method, *pair) for method in METHODS for pair in SETTINGS]
         report["singular_values"] = _singular_values(elements)
         if figures is not None:
@@ -125,6 +116,19 @@ class _Bench:
         weights = np.ones((len(ids), 3), np.float32)
         seconds, _ = timed(self._elements.sum_columns, np.sort(ids), weights)
         return {"seconds": seconds * n / len(ids), "columns_timed": len(ids)}
+
+    def curves(self, run: Run) -> dict[str, list[dict[str, Any]]]:
+        """Of both methods at all ratios, and of the baselines."""
+        found = {}
+        with run.bar(len(METHODS) * len(RATIOS) + 2, "curves", " curves") as bar:
+            for method in METHODS:
+                for name, ratio in RATIOS.items():
+                    found[f"{method} {name}"] = self.curve(method, ratio)
+                    bar.update()
+            for name in ("instant radiosity", "power sampling"):
+                found[name] = self.baseline(name)
+                bar.update()
+        return found
 
     def curve(self, method: str, ratio: float) -> list[dict[str, Any]]:
         """A point for each size."""

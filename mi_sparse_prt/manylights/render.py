@@ -190,8 +190,7 @@ def render_many_lights(
     with run.clock.phase("load"):
         view = find_view(scene, sensor)
     found = RowColumn(matrix_of(view, asked, run), asked, run)
-    estimate = found.estimate(preview)
-    return found.picture(estimate)
+    return found.picture(found.estimate(preview))
 
 
 def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> View:
