@@ -16,13 +16,12 @@ from scipy.cluster.vq import kmeans2
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.manylights.particles import next_2d
-from mi_sparse_prt.manylights.surfaces import Surfaces, diffuse_value
+from mi_sparse_prt.manylights.surfaces import BENT, Surfaces, diffuse_value
 from mi_sparse_prt.measurement.pixels import jittered_places
 from mi_sparse_prt.scene.instances import placed_shapes
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
-BENT = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
-_CAMERA = 0x5A17  # key of random numbers
+_CAMERA, _COATS = 0x5A17, 0x5A18  # keys of random numbers
 
 LEAST_ROWS = 12  # of a slice of samples
 
@@ -58,7 +57,9 @@ class Samples:
     """Samples of a film's pixels: the rows of the matrix.
 
     Rays of the camera follow mirrors, glass and holes up to the first surface that also does something else; there the
-    sample is. Those that leave the scene, or end on the way, have no row.
+    sample is. Those that leave the scene, or end on the way, have no row. Where that surface reflects into single
+    directions as well (plastic, a coat), one sample of each pixel has a second row, of what is seen by way of these: it
+    counts as if all had one.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ class Samples:
     shape : tuple of int
         (height, width) of the image.
     ids : (m,) int64
-        Of all samples, pixel by pixel, those that have a row.
+        The sample of each row, ascending, pixel by pixel.
     seen : (n_samples, 3) float32
         Radiance that each sees without reflection, of lamps and of the environment.
 
@@ -98,12 +99,17 @@ class Samples:
         self._scene = scene
         ray, weight, rng = _camera_rays(sensor, self._places, seed)
         limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
-        seen, ray, hit, weight, depth, found = _follow(scene, ray, weight, rng, limit)
+        sample, coats = _lanes(width * height, spp, seed, surfaces.coated)
+        lane, by_coats = mi.UInt32(sample.astype(np.uint32)), mi.Bool(coats)
+        ray, weight, rng = (dr.gather(type(x), x, lane) for x in (ray, weight, rng))
+        weight *= dr.select(by_coats, mi.Float(spp), 1)
+        seen, ray, hit, weight, depth, found = _follow(scene, ray, weight, rng, limit, by_coats)
         dr.eval(seen, ray, hit, weight, depth, found)
-        self.seen: Floats = np.ascontiguousarray(seen.numpy().T)
-        self.covered = found.numpy() | (self.seen > 0).any(axis=1)
+        self.seen: Floats = seen.numpy().T[~coats]
+        self.covered = found.numpy()[~coats] | (self.seen > 0).any(axis=1)
+        self.seen[sample[coats]] += seen.numpy().T[coats]
         index = dr.compress(found)
-        self.ids = index.numpy().astype(np.int64)
+        self.ids = sample[index.numpy()]
         if len(self.ids):
             ray, hit, weight, depth = (dr.gather(type(x), x, index) for x in (ray, hit, weight, depth))
             self._hit, self._ray, self._depth = hit, ray, depth
@@ -135,7 +141,7 @@ class Samples:
     def image(self, values: Floats, visible: bool = True) -> Floats:
         """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
         every = self.seen.copy() if visible else np.zeros_like(self.seen)
-        every[self.ids] += values
+        np.add.at(every, self.ids, values)
         return self.filtered(every)
 
     def filtered(self, every: Floats) -> Floats:
@@ -252,11 +258,28 @@ def _camera_rays(sensor: mi.Sensor, places: Floats, seed: int) -> tuple[mi.Ray3f
     return mi.Ray3f(ray), mi.Color3f(weight), rng
 
 
+def _lanes(pixels: int, spp: int, seed: int, coated: bool) -> tuple[Ids, NDArray[np.bool_]]:
+    """The sample of each ray, pixel by pixel; of one at random of each pixel a second ray, by way of coats, if any."""
+    if not coated:
+        return np.arange(pixels * spp), np.zeros(pixels * spp, bool)
+    every = np.arange(pixels * spp).reshape(pixels, spp)
+    again = every[:, 0] + np.random.default_rng([seed, _COATS]).integers(spp, size=pixels)
+    sample = np.append(every, again[:, None], axis=1)
+    coats = np.broadcast_to(np.arange(spp + 1) == spp, sample.shape)
+    order = np.argsort(sample, axis=1, kind="stable")
+    return np.take_along_axis(sample, order, axis=1).ravel(), np.take_along_axis(coats, order, axis=1).ravel()
+
+
 @dr.syntax
 def _follow(
-    scene: mi.Scene, ray: mi.Ray3f, weight: mi.Color3f, rng: mi.PCG32, limit: mi.UInt32
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    weight: mi.Color3f,
+    rng: mi.PCG32,
+    limit: mi.UInt32,
+    by_coats: mi.Mask,
 ) -> tuple[mi.Color3f, mi.Ray3f, mi.PreliminaryIntersection3f, mi.Color3f, mi.UInt32, mi.Mask]:
-    """Follow rays to surfaces that are not only specular.
+    """Follow rays to surfaces that are not only specular; ``by_coats`` those of what is beyond the first coat.
 
     Returns
     -------
@@ -271,17 +294,19 @@ def _follow(
         Whether there is such a surface.
     """
     ray, weight = mi.Ray3f(ray), mi.Color3f(weight)
-    seen, depth = mi.Color3f(0), mi.UInt32(0)
+    seen, depth, before = mi.Color3f(0), mi.UInt32(0), mi.Mask(by_coats)
     found, active = mi.Mask(False), limit > 0
     kept_ray, kept_hit = mi.Ray3f(ray), dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
     active &= dr.max(weight) > 0
     while active:
         hit = scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
-        seen += dr.select(active, weight * si.emitter(scene, active).eval(si, active), 0)
+        shown = active & ~before
+        seen += dr.select(shown, weight * si.emitter(scene, shown).eval(si, shown), 0)
         active &= si.is_valid() & (depth + 1 < limit)
-        goes_on, out, factor = _specular(si, rng, active)
-        stays = active & ~goes_on
+        goes_on, reflected, out, factor = _specular(si, rng, active, before, by_coats)
+        before &= ~reflected
+        stays = active & ~goes_on & ~before
         kept_ray = dr.select(stays, ray, kept_ray)
         kept_hit = dr.select(stays, hit, kept_hit)
         found |= stays
@@ -293,9 +318,11 @@ def _follow(
 
 
 def _specular(
-    si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
-) -> tuple[mi.Mask, mi.Vector3f, mi.Color3f]:
-    """Whether rays go on from surfaces, where to (world), and what either choice weighs.
+    si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask, before: mi.Mask, by_coats: mi.Mask
+) -> tuple[mi.Mask, mi.Mask, mi.Vector3f, mi.Color3f]:
+    """Whether rays go on from surfaces, and by a coat, where to (world), and what either choice weighs.
+
+    Rays that are not ``by_coats`` stay at these, and the others go on from the first one.
 
     Where there is nothing but mirrors and glass, they do, as Mitsuba's BSDF samples it. Otherwise they pass holes as
     often as light does; and go on by other single directions as often as these reflect, about, which is known from a
@@ -318,7 +345,8 @@ def _specular(
     # a coat, or something else that reflects into single directions, beside what spreads light
     mixed = active & smooth & bent & ~hole
     _, guess = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), mixed & ~null)
-    p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.2, 0.8))
+    p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.02, 0.98))
+    p_bent = dr.select(by_coats, dr.select(before, 1, p_bent), 0)
     follows = mixed & (choice < p_bent)
     some, its = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), follows & ~null)
     only = active & ~smooth
@@ -331,4 +359,4 @@ def _specular(
 
     out = dr.select(only | null, si.to_world(other.wo), si.to_world(some.wo))
     out = dr.select(hole, si.to_world(-si.wi), out)
-    return active & (only | hole | follows), out, factor
+    return active & (only | hole | follows), follows, out, factor

@@ -11,6 +11,9 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.instances import placed_shapes
 from mi_sparse_prt.scene.materials import bends_normals, is_one_of
 
+#: Of lobes that send light into single directions, but straight on.
+BENT = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+
 
 class Surfaces:
     """All BSDFs of a scene, those of instances too.
@@ -23,6 +26,8 @@ class Surfaces:
     ----------
     passes_straight : bool
         Some surfaces let light pass straight on: masks, thin panes, ``null``.
+    coated : bool
+        Some reflect into single directions, and do something else as well.
     all_lambertian : bool
         All reflect diffusely, and do nothing else.
 
@@ -45,6 +50,9 @@ class Surfaces:
         bsdfs = list(found.values())
         self._bent = [bsdf for bsdf in bsdfs if bends_normals(bsdf)]
         self.passes_straight = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+        self.coated = any(
+            mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and bsdf.flags() & BENT for bsdf in bsdfs
+        )
         self.all_lambertian = not self._bent and all(_lambertian(bsdf.flags()) for bsdf in bsdfs)
 
     def lambertian(self, si: mi.SurfaceInteraction3f) -> mi.Mask:
