@@ -12,6 +12,7 @@ from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedCol
 from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_costs, split_clusters, with_lengths
 
 DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
+EVERYWHERE = 0.5  # of the weights of a slice's own rows, those of all rows count as well: its rows are few
 UNSEEN = 0.1  # of the clusters, at most, are for columns that no row sees
 SECOND = 0.1  # of the clusters have a second representative, which tells the error
 
@@ -168,7 +169,7 @@ def refined(
         x = (reduced.kept[own].astype(np.float32) * reduced.scales[own, None]).T  # [light, row]
         norms = np.linalg.norm(x, axis=1).astype(np.float64)
         every = partition.drawing / max(partition.drawing[~unseen].sum(), 1e-300)
-        drawing = norms + DEFENSIVE * norms.sum() * (every + 1 / len(norms))
+        drawing = norms + norms.sum() * (EVERYWHERE * every + DEFENSIVE / len(norms))
         drawing[unseen] = partition.drawing[unseen]
         drawing = drawing if norms.any() else partition.drawing
         clusters = split_clusters(np.ascontiguousarray(x), norms, partition.clusters, count, rng)
