@@ -154,6 +154,7 @@ class Elements:
         for first, size in _pieces(count, max(1, LANES // m)):
             total = self._accumulated(total, lane, chosen, first, size)
             dr.eval(total)
+            dr.sync_thread()  # so that progress is that of rays
             done(size)
         self.evaluated += m * count
         found = np.ascontiguousarray(total.numpy().T)
