@@ -134,13 +134,12 @@ def relight(
 
     One light at a time: mi-sparse-prt relight bunny.prt --each 331 -o bunny_lights
     """
+    given = matrix, scene, options.definitions(define)
     if each is not None:
         _check_each(environment, output, vertices, frames)
         assert output is not None
         with running(json_file, quiet) as command:
-            _relight_each(
-                command, (matrix, scene, options.definitions(define)), each, output, (sensor, spp), quiet
-            )
+            _relight_each(command, given, each, output, (sensor, spp), quiet)
         return
     if environment is None:
         raise typer.BadParameter("no light: give -e ENVIRONMENT, or --each LIGHTS", param_hint="-e")
