@@ -143,10 +143,7 @@ def relight(
         return
     if environment is None:
         raise typer.BadParameter("no light: give -e ENVIRONMENT, or --each LIGHTS", param_hint="-e")
-    if frames is None:
-        _check_pictures(output, vertices, to)
-    else:
-        _check_film(output, vertices, frames, fps)
+    _check_files(output, vertices, to, frames, fps)
     folder = frames is not None and output is not None and not _is_film(output)
     with running(json_file, quiet, outputs=[None if folder else output, vertices]) as command:
         # before the clock starts
@@ -160,15 +157,11 @@ def relight(
         clock = Stopwatch()
         with command.prompt_interrupts(), clock.phase("load"):
             light, last = load_environment(environment), None if to is None else load_environment(to)
-            loaded = with_scene(load_transport(matrix), matrix, scene, options.definitions(define))
-        report: dict[str, Any] = {"matrix": str(matrix), "rotation_degrees": rotate}
-        report["environment"] = light.report
-        view = _View(*loaded, sensor, spp)
-        if vertices is not None and view.transport.terms:
-            raise PrtError(f"{matrix} has glossy surfaces, whose light depends on the view: give -o instead")
+            view = _View(*with_scene(load_transport(matrix), *given), sensor, spp)
+        report: dict[str, Any] = {"matrix": str(matrix), "environment": light.report}
+        report["rotation_degrees"] = rotate
         if frames is not None and output is not None:
-            if last is not None:
-                report["to"] = last.report
+            report |= {} if last is None else {"to": last.report}
             with clock.phase("render"):
                 into = new_frames(command, output, frames, fps, exposure, folder)
                 images = view.film(film_lights(light, last, rotate, frames))
@@ -177,16 +170,13 @@ def relight(
             report["film"] |= {} if folder else {"fps": fps}
         else:
             with command.prompt_interrupts():
-                files, about = _pictures(
-                    view, light.rotated(rotate), output, vertices, exposure, not quiet, clock
-                )
+                lit = light.rotated(rotate)
+                files, about = _pictures(view, lit, output, vertices, exposure, not quiet, clock)
             report |= about
-            for path, content in files.items():
-                command.write(path, content)
-            sizes = {path: len(content) for path, content in files.items()}
+            sizes = command.write_all(files)
         command.report = report | {"seconds": clock.report()}
-        title = f"{matrix} under {environment}, turned by {rotate:g} degrees"
-        command.show(relighting_table(title, clock.seconds, sizes))
+        what = f"{matrix} under {environment}, turned by {rotate:g} degrees"
+        command.show(relighting_table(what, clock.seconds, sizes))
 
 
 def _relight_each(
@@ -228,6 +218,10 @@ def _pictures(
     from mi_sparse_prt.cli.files import image_bytes, vertices_bytes
 
     files, report = dict[Path, bytes](), dict[str, Any]()
+    if vertices is not None and view.transport.terms:
+        raise PrtError(
+            "the matrix has glossy surfaces, whose light depends on the view: give -o, not --vertices"
+        )
     with clock.phase("relight"):
         radiance = view.transport.relight(light)  # [vertex, rgb]
     if vertices is not None:
@@ -239,6 +233,15 @@ def _pictures(
         files[output] = image_bytes(image, output.suffix.lower(), exposure)
         report["image"] = {"path": str(output), "mean": image.mean(axis=(0, 1)).tolist()}
     return files, report
+
+
+def _check_files(
+    output: Path | None, vertices: Path | None, to: Path | None, frames: int | None, fps: float
+) -> None:
+    if frames is None:
+        _check_pictures(output, vertices, to)
+    else:
+        _check_film(output, vertices, frames, fps)
 
 
 def _check_pictures(output: Path | None, vertices: Path | None, to: Path | None) -> None:

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,12 @@ class Command:
     def show(self, *tables: Table) -> None:
         for table in tables:
             self._console.print(table)
+
+    def write_all(self, files: Mapping[Path, bytes]) -> dict[Path, int]:
+        """Write some files, see ``write``; their sizes."""
+        for path, content in files.items():
+            self.write(path, content)
+        return {path: len(content) for path, content in files.items()}
 
     def write(self, path: Path, content: bytes, part_of: Path | None = None) -> None:
         """Write a file under a temporary name beside it, and rename it when it is complete.
