@@ -136,7 +136,7 @@ class LampPaths(PathSolver):
             lamp, radiance = lamp_met(self.problem, ray, active)
             return dr.select(active & (lamp == mi.Int32(texel)), radiance, 0)
 
-        light = Light(sample, scattered=True)
+        light = Light(sample, scattered=True, rough_glass=self._world.rough_glass)
         if has_mirrors(self.scene):
             light.met = met
         return trace_reflected(self.scene, ray, light, rng, bounces)

@@ -120,9 +120,8 @@ class Answers:
             eye = _vector(question, "eye")
             away = eye - self.scene.positions
             away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-30)
-            gloss = (
-                self.transport.leaving(found, away) - self.scene.albedo * parts[0]
-            )  # the page adds the latter
+            by_page = self.scene.albedo * parts[0]
+            gloss = self.transport.leaving(found, away) - by_page
             faces = np.einsum("ij,ij->i", away, self.scene.normals) > 0  # what leaves others is not known
             parts.append(np.where(faces[:, None], gloss, 0))
         elif self._lamps is not None:

@@ -23,7 +23,7 @@ PATIENCE = 10.0  # seconds that a browser may take to ask, or to read
 ASK = "ask"  # where questions go, beside the page
 LONGEST = 1 << 28  # bytes of a question
 
-Answer = Callable[[dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
+Reply = Callable[[dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
 
 
 class PageServer(ThreadingHTTPServer):
@@ -51,7 +51,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, page: bytes, port: int = 0, answer: Answer | None = None) -> None:
+    def __init__(self, page: bytes, port: int = 0, answer: Reply | None = None) -> None:
         self.page, self.answer, self._token = page, answer, secrets.token_urlsafe(16)
         try:
             super().__init__((ADDRESS, port), _Answer)
@@ -126,7 +126,7 @@ class _Answer(BaseHTTPRequestHandler):
             self.close_connection = True  # the browser went away, or stopped reading
 
 
-def _answered(answer: Answer, asked: bytes) -> bytes:
+def _answered(answer: Reply, asked: bytes) -> bytes:
     """A question in bytes, answered in bytes."""
     try:
         (length,) = struct.unpack_from("<I", asked)
