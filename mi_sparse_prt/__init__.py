@@ -24,6 +24,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.relighting.light import TurningLight
     from mi_sparse_prt.relighting.relighter import Relighter
     from mi_sparse_prt.relighting.viewer.export import Page, make_page
+    from mi_sparse_prt.relighting.viewer.mixer import make_mixer
     from mi_sparse_prt.relighting.viewer.widget import Viewer, show
     from mi_sparse_prt.scene.loading import load_scene
     from mi_sparse_prt.scene.scene import Scene
@@ -52,6 +53,7 @@ _MODULES = {
     "load_environment": "emission.environment",
     "load_scene": "scene.loading",
     "load_transport": "storage",
+    "make_mixer": "relighting.viewer.mixer",
     "make_page": "relighting.viewer.export",
     "mesh_vertices": "measurement.measurement",
     "precompute": "precompute",
@@ -83,6 +85,7 @@ __all__ = [
     "load_environment",
     "load_scene",
     "load_transport",
+    "make_mixer",
     "make_page",
     "mesh_vertices",
     "precompute",

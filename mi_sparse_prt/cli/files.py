@@ -27,15 +27,6 @@ def image_bytes(image: NDArray[np.float32], suffix: str, exposure: float, half: 
     return bytes(stream.raw_buffer())
 
 
-def layers_bytes(image: NDArray[np.float32], layers: dict[str, NDArray[np.float32]]) -> bytes:
-    """A linear RGB image (height, width, 3) and layers of it, by name, as the content of one .exr file."""
-    stream, names = mi.MemoryStream(), [f"{name}.{c}" for name in layers for c in "RGB"]
-    pixels = np.concatenate([image, *layers.values()], axis=2)
-    bitmap = mi.Bitmap(np.ascontiguousarray(pixels, np.float32), channel_names=["R", "G", "B", *names])
-    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    return bytes(stream.raw_buffer())
-
-
 def srgb_pixels(image: NDArray[np.float32], exposure: float) -> NDArray[np.uint8]:
     """A linear RGB image (height, width, 3) in sRGB, brightened by ``exposure`` stops."""
     bitmap = mi.Bitmap(np.ascontiguousarray(image * np.float32(2.0**exposure)))

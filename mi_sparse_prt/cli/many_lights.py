@@ -108,8 +108,9 @@ def many_lights(
     if groups and output.suffix.lower() == ".png":
         raise typer.BadParameter("layers need an .exr file: give -o FILE.exr", param_hint="--groups")
     with running(json_file, quiet, outputs=[output]) as command:
-        from mi_sparse_prt.cli.files import image_bytes, layers_bytes
+        from mi_sparse_prt.cli.files import image_bytes
         from mi_sparse_prt.cli.tables.many_lights import many_lights_table
+        from mi_sparse_prt.io.exr_layers import layers_bytes
         from mi_sparse_prt.scene.loading import load_mitsuba
 
         def write(image: NDArray[np.float32]) -> None:

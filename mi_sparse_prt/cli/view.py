@@ -1,4 +1,4 @@
-"""``mi-sparse-prt view``: a matrix in the browser, or as a page in a file."""
+"""``mi-sparse-prt view``: a matrix, or the lamps of a picture, in the browser or as a page in a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from mi_sparse_prt.cli.tables.written import relighting_table
 
 if TYPE_CHECKING:
     from mi_sparse_prt import Environment, Scene
-    from mi_sparse_prt.relighting.viewer import LivePage
+    from mi_sparse_prt.core.profiling import Stopwatch
+    from mi_sparse_prt.relighting.viewer.server import Reply
 
 Environments = Annotated[
     list[Path] | None,
@@ -38,10 +39,16 @@ Kept = Annotated[
 ]
 Port = Annotated[int, typer.Option(help="Of the page on this machine; 0 for any that is free.")]
 Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")]
+Shown = Annotated[
+    Path,
+    options.file_argument(
+        "FILE", "Matrix that `precompute` wrote, or picture (.exr) that `many-lights --groups` wrote."
+    ),
+]
 
 
 def view(
-    matrix: options.MatrixFile,
+    file: Shown,
     environment: Environments = None,
     export: Export = None,
     kept: Kept = 0.05,
@@ -59,10 +66,17 @@ def view(
     Example: mi-sparse-prt view bunny.prt
 
     To send by mail: mi-sparse-prt view bunny.prt --export bunny.html
+
+    To mix the lamps of a picture: mi-sparse-prt view room.exr
     """
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise typer.BadParameter(f"{export}: give a name that ends in .html", param_hint="--export")
+    is_picture = file.suffix.lower() == ".exr"
+    if is_picture and (environment or scene or define):
+        raise typer.BadParameter("a picture has its light inside: give a matrix with -e, --scene or -D")
     with running(json_file, quiet, outputs=[export]) as command:
+        if is_picture:
+            return _mix(command, file, export, port, browser)
         from mi_sparse_prt import compress, load_transport
         from mi_sparse_prt.core.profiling import Stopwatch
         from mi_sparse_prt.relighting.viewer import LivePage, make_live_page, make_page
@@ -70,9 +84,7 @@ def view(
         clock = Stopwatch()
         with command.prompt_interrupts():
             with clock.phase("load"):
-                loaded, transport = with_scene(
-                    load_transport(matrix), matrix, scene, options.definitions(define)
-                )
+                loaded, transport = with_scene(load_transport(file), file, scene, options.definitions(define))
                 lights = {} if transport.lights else _lights(loaded, environment)
             diffuse = not transport.terms and not transport.lights
             if diffuse and "compressed" not in transport.operators:
@@ -81,17 +93,42 @@ def view(
             with clock.phase("page"):
                 make = make_live_page if export is None else make_page
                 made = make(
-                    loaded, transport, lights, kept=kept, sensor=_camera(loaded, sensor), title=matrix.stem
+                    loaded, transport, lights, kept=kept, sensor=_camera(loaded, sensor), title=file.stem
                 )
-        page = made.text.encode()
-        command.report = {"matrix": str(matrix), "bytes": len(page), "notes": made.notes}
-        command.report |= {"environments": list(lights), "kept": kept, "seconds": clock.report()}
-        if export is not None:
-            command.write(export, page)
-            command.show(relighting_table(f"{matrix} as a page", clock.seconds, {export: len(page)}))
+        command.report = {"matrix": str(file), "notes": made.notes, "environments": list(lights)}
+        command.report |= {"kept": kept}
+        if _written(command, file, made.text, export, clock):
             return
         assert isinstance(made, LivePage)
-        _serve(command, made, port, browser)
+        with closing(made.answers):
+            _serve(command, made.text, port, browser, made.answers.reply)
+
+
+def _mix(command: Command, file: Path, export: Path | None, port: int, browser: bool) -> None:
+    """A light mixer of a picture with layers."""
+    from mi_sparse_prt.core.profiling import Stopwatch
+    from mi_sparse_prt.io.exr_layers import read_layers
+    from mi_sparse_prt.relighting.viewer import make_mixer
+
+    clock = Stopwatch()
+    with command.prompt_interrupts():
+        with clock.phase("load"):
+            layers = read_layers(file)
+        with clock.phase("page"):
+            made = make_mixer(layers, file.stem)
+    command.report = {"picture": str(file), "lamps": list(layers)}
+    if not _written(command, file, made.text, export, clock):
+        _serve(command, made.text, port, browser)
+
+
+def _written(command: Command, file: Path, text: str, export: Path | None, clock: Stopwatch) -> bool:
+    """Report on a page, and write it if it is to be a file; whether it was."""
+    page = text.encode()
+    command.report |= {"bytes": len(page), "seconds": clock.report()}
+    if export is not None:
+        command.write(export, page)
+        command.show(relighting_table(f"{file} as a page", clock.seconds, {export: len(page)}))
+    return export is not None
 
 
 def _lights(scene: Scene, files: list[Path] | None) -> dict[str, Environment]:
@@ -113,11 +150,11 @@ def _camera(scene: Scene, sensor: int) -> int | None:
     return None if sensor == 0 and not scene.mitsuba.sensors() else sensor
 
 
-def _serve(command: Command, page: LivePage, port: int, browser: bool) -> None:
-    """Show the page, and answer it, until Ctrl-C."""
+def _serve(command: Command, text: str, port: int, browser: bool, answer: Reply | None = None) -> None:
+    """Show a page, and answer it, until Ctrl-C."""
     from mi_sparse_prt.relighting.viewer.server import PageServer
 
-    with PageServer(page.text.encode(), port, page.answers.reply) as server, closing(page.answers):
+    with PageServer(text.encode(), port, answer) as server:
         typer.echo(f"{server.url}  (Ctrl-C ends it)", err=True)
         command.hint = ": the page is closed"
         if browser:

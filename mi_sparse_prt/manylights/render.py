@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,8 +52,6 @@ GLOBAL = 0.6  # of the clusters are found for all samples
 EARLY = 9  # times fewer columns for a preview
 RESERVE = 0.05  # of a time budget
 
-VISIBLE = "visible"  # the layer of emitters that the camera sees
-
 Clusters = Partition | LocalPartitions
 View = tuple[mi.Scene, mi.Sensor]
 
@@ -77,8 +75,8 @@ class ManyLightsImage:
     alpha : (height, width) float32
         Share of each pixel that is covered by what the scene shows.
     layers : dict of str to (height, width, 3) float32
-        Of ``groups``: what each emitter of the scene adds, by name, and ``visible``: emitters that are seen. Their sum
-        is the image. Under other colours and intensities of the emitters, it is another weighted sum.
+        Of ``groups``: what each emitter of the scene adds, by name, itself where it is seen among it. Their sum is the
+        image. Under other colours and intensities of the emitters, it is another weighted sum (``mixed``).
     report : dict
         ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
         ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known),
@@ -89,6 +87,39 @@ class ManyLightsImage:
     alpha: NDArray[np.float32]
     layers: dict[str, Floats]
     report: dict[str, Any]
+
+    def mixed(self, weights: Mapping[str, float | Sequence[float]]) -> Floats:
+        """The image (height, width, 3) under emitters of other intensities and colours: a weighted sum of layers.
+
+        Parameters
+        ----------
+        weights : dict of str to float or RGB
+            By what the radiance of each emitter is multiplied; 1 for those that are not named.
+
+        Raises
+        ------
+        PrtError
+            There are no layers, or none of that name; a weight is not one or three numbers of 0 or more.
+        """
+        if not self.layers:
+            raise PrtError("the picture has no layers to mix: render it with groups=True")
+        if unknown := [name for name in weights if name not in self.layers]:
+            raise PrtError(f"no emitter is named {unknown[0]!r}: choose from {', '.join(self.layers)}")
+        image = np.zeros_like(self.image)
+        for name, layer in self.layers.items():
+            image += layer * _rgb_weight(name, weights.get(name, 1.0))
+        return image
+
+
+def _rgb_weight(name: str, weight: float | Sequence[float]) -> Floats:
+    """One or three numbers of 0 or more."""
+    try:
+        found = np.asarray(weight, np.float32)
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan, np.float32)
+    if found.shape not in ((), (3,)) or not np.all(np.isfinite(found) & (found >= 0)):
+        raise PrtError(f"the weight of {name!r} is {weight!r}: give a number of 0 or more, or three of them")
+    return found
 
 
 @dataclass(frozen=True)
@@ -220,7 +251,9 @@ def matrix_of(view: View, settings: Settings, run: Run) -> Elements:
     scene, sensor = view
     surfaces = Surfaces(scene)
     with run.clock.phase("samples"):
-        samples = Samples(scene, surfaces, sensor, settings.spp, settings.max_depth, settings.seed)
+        samples = Samples(
+            scene, surfaces, sensor, settings.spp, settings.max_depth, settings.seed, settings.groups
+        )
     with run.clock.phase("lights"):
         lights = scene_lights(scene, settings.light_options())
     return Elements(scene, surfaces, samples, lights)
@@ -370,9 +403,10 @@ class RowColumn:
             image = self.samples.image(estimate.values)
             covered = self.samples.covered.astype(np.float32)[:, None]
             alpha = self.samples.filtered(covered)[..., 0]
-            layers = {name: self.samples.image(v, visible=False) for name, v in self.layers.items()}
-            if layers:
-                layers[VISIBLE] = self.samples.filtered(self.samples.seen)
+            names, dark = self.lights.names if self.settings.groups else (), np.zeros((1, 3), np.float32)
+            layers = {
+                name: self.samples.image_of(k, self.layers.get(name, dark)) for k, name in enumerate(names)
+            }
         return ManyLightsImage(image, alpha, layers, self._report(image, estimate.squared_error))
 
     def _report(self, image: Floats, squared_error: float) -> dict[str, Any]:

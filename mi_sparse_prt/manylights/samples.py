@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -73,6 +74,8 @@ class Samples:
     max_depth : int
         As for ``path``.
     seed : int
+    apart : bool
+        Tell apart what is seen of each emitter.
 
     Attributes
     ----------
@@ -82,6 +85,8 @@ class Samples:
         The sample of each row, ascending, pixel by pixel.
     seen : (n_samples, 3) float32
         Radiance that each sees without reflection, of lamps and of the environment.
+    seen_of : dict of int to (n_samples, 3) float32
+        Of ``apart``: what ``seen`` is the sum of, by the numbers of the scene's emitters; of those that are seen.
 
     Raises
     ------
@@ -90,7 +95,14 @@ class Samples:
     """
 
     def __init__(
-        self, scene: mi.Scene, surfaces: Surfaces, sensor: mi.Sensor, spp: int, max_depth: int, seed: int
+        self,
+        scene: mi.Scene,
+        surfaces: Surfaces,
+        sensor: mi.Sensor,
+        spp: int,
+        max_depth: int,
+        seed: int,
+        apart: bool = False,
     ) -> None:
         film = sensor.film()
         width, height = (int(n) for n in film.crop_size())
@@ -103,11 +115,14 @@ class Samples:
         lane, by_coats = mi.UInt32(sample.astype(np.uint32)), mi.Bool(coats)
         ray, weight, rng = (dr.gather(type(x), x, lane) for x in (ray, weight, rng))
         weight *= dr.select(by_coats, mi.Float(spp), 1)
-        seen, ray, hit, weight, depth, found = _follow(scene, ray, weight, rng, limit, by_coats)
+        sums = _SeenOf(scene, lane, width * height * spp) if apart else None
+        note = sums.add if sums else lambda *_: None
+        seen, ray, hit, weight, depth, found = _follow(scene, ray, weight, rng, limit, by_coats, note)
         dr.eval(seen, ray, hit, weight, depth, found)
         self.seen: Floats = seen.numpy().T[~coats]
         self.covered = found.numpy()[~coats] | (self.seen > 0).any(axis=1)
         self.seen[sample[coats]] += seen.numpy().T[coats]
+        self.seen_of = sums.found() if sums else {}
         index = dr.compress(found)
         self.ids = sample[index.numpy()]
         if len(self.ids):
@@ -138,9 +153,16 @@ class Samples:
         found = (w.name for w in placed_shapes(self._scene) if dr.all(met == mi.ShapePtr(w.shape)))
         return f"shape '{next(found, 'of an instance')}' (pixel {x}, {y})"
 
-    def image(self, values: Floats, visible: bool = True) -> Floats:
+    def image(self, values: Floats) -> Floats:
         """The image (height, width, 3) of the radiance (m, 3) of rows, and of what samples see besides."""
-        every = self.seen.copy() if visible else np.zeros_like(self.seen)
+        return self._image(values, self.seen.copy())
+
+    def image_of(self, number: int, values: Floats) -> Floats:
+        """``image`` of one emitter alone."""
+        seen = self.seen_of.get(number)
+        return self._image(values, np.zeros_like(self.seen) if seen is None else seen.copy())
+
+    def _image(self, values: Floats, every: Floats) -> Floats:
         np.add.at(every, self.ids, values)
         return self.filtered(every)
 
@@ -243,6 +265,43 @@ class Samples:
         return order[np.minimum(at, len(self) - 1)]
 
 
+class _SeenOf:
+    """Sums of the radiance that samples see of each emitter.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    sample : UInt32
+        Of each ray.
+    count : int
+        Samples.
+    """
+
+    def __init__(self, scene: mi.Scene, sample: mi.UInt32, count: int) -> None:
+        emitters, on_device = scene.emitters(), scene.emitters_dr()
+        self._emitters = [
+            k for k, e in enumerate(emitters) if not mi.has_flag(e.flags(), mi.EmitterFlags.Delta)
+        ]
+        self._sample, self._count, self._place = sample, count, mi.UInt32(0)
+        if emitters:  # from what Dr.Jit calls an emitter to its place in the sums
+            ids = dr.reinterpret_array(mi.UInt32, on_device).numpy()[self._emitters]
+            place = np.zeros(ids.max(initial=0) + 1, np.uint32)
+            place[ids] = np.arange(len(ids))
+            self._place = mi.UInt32(place)
+        self._sums = dr.zeros(mi.Float, 3 * count * max(len(self._emitters), 1))
+
+    def add(self, emitter: mi.EmitterPtr, radiance: mi.Color3f, active: mi.Mask) -> None:
+        """What some rays see of emitters."""
+        active = active & (emitter != None)  # noqa: E711 (on the device)
+        place = dr.gather(mi.UInt32, self._place, dr.reinterpret_array(mi.UInt32, emitter), active)
+        dr.scatter_reduce(dr.ReduceOp.Add, self._sums, radiance, place * self._count + self._sample, active)
+
+    def found(self) -> dict[int, Floats]:
+        """Sums (samples, 3) by the numbers of emitters, without those that nobody sees."""
+        sums = self._sums.numpy().reshape(-1, self._count, 3)
+        return {number: own for number, own in zip(self._emitters, sums, strict=False) if own.any()}
+
+
 def _squared_distances(x: Floats, centres: Floats) -> Floats:
     """(n, k), but for what depends on x alone."""
     return (centres**2).sum(axis=1) - 2 * (x @ centres.T)
@@ -278,8 +337,11 @@ def _follow(
     rng: mi.PCG32,
     limit: mi.UInt32,
     by_coats: mi.Mask,
+    note: Callable[[mi.EmitterPtr, mi.Color3f, mi.Mask], object],
 ) -> tuple[mi.Color3f, mi.Ray3f, mi.PreliminaryIntersection3f, mi.Color3f, mi.UInt32, mi.Mask]:
     """Follow rays to surfaces that are not only specular; ``by_coats`` those of what is beyond the first coat.
+
+    ``note`` is told what they see of emitters on the way.
 
     Returns
     -------
@@ -302,7 +364,10 @@ def _follow(
         hit = scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
         shown = active & ~before
-        seen += dr.select(shown, weight * si.emitter(scene, shown).eval(si, shown), 0)
+        emitter = si.emitter(scene, shown)
+        radiance = dr.select(shown, weight * emitter.eval(si, shown), 0)
+        seen += radiance
+        note(emitter, radiance, shown)
         active &= si.is_valid() & (depth + 1 < limit)
         goes_on, reflected, out, factor = _specular(si, rng, active, before, by_coats)
         before &= ~reflected

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
-from pathlib import Path
-from string import Template
 from typing import Any
 
 import mitsuba as mi
@@ -18,12 +14,12 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.emission.haar import haar_bands, haar_colours
-from mi_sparse_prt.io.atomic import write_atomically
 from mi_sparse_prt.operators.clustered import Clustered
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
 from mi_sparse_prt.relighting.viewer import page_scene
 from mi_sparse_prt.relighting.viewer.archive import packed
+from mi_sparse_prt.relighting.viewer.page_file import PageFile, page_text
 from mi_sparse_prt.relighting.viewer.truncated_clusters import TruncatedClusters, truncate_clusters
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -31,15 +27,18 @@ from mi_sparse_prt.transport import LightTransport
 KEPT = 0.05  # of the wavelet coefficients of all basis vectors, if not given
 TURNS = 8  # azimuths of each environment, whose wavelets say how large those of light are
 BLACK = 1e-30  # power of an environment that shines at all
-SCRIPTS = ("archive", "light", "wavelets", "radiance_file", "camera", "picture", "python", "main")
+SCRIPTS = (
+    *("archive", "shared", "light", "wavelets", "radiance_file", "camera", "webgl", "picture", "python"),
+    "main",
+)
 DIFFERENCES = frozenset({"triangles", "starts", "order", "labels"})  # are kept as such
 MOST = 1 << 16  # columns, and wavelets, that the page can number
 
 Floats = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Page:
+@dataclass(frozen=True, repr=False)
+class Page(PageFile):
     """A page, and what is in it.
 
     Attributes
@@ -59,28 +58,6 @@ class Page:
     text: str
     clusters: ClusterColumns
     notes: tuple[str, ...]
-
-    def save(self, path: str | Path) -> None:
-        """Write the page as a file, whole or not at all.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written; nothing is left behind then.
-        """
-
-        def write(temporary: Path) -> None:
-            temporary.write_text(self.text, "utf-8")
-
-        write_atomically(Path(path), write)
-
-    def _repr_html_(self) -> str:
-        """The page itself, in a notebook."""
-        frame = "width: 100%; height: 480px; border: 0"
-        return f'<iframe style="{frame}" srcdoc="{html.escape(self.text)}"></iframe>'
-
-    def __repr__(self) -> str:
-        return f"Page({len(self.text) / 1e6:.1f} MB of HTML)"
 
 
 def make_page(
@@ -121,7 +98,7 @@ def make_page(
     operator, drawn = _played(transport), page_scene.draw_order(scene)
     played, arrays, header = played_part(operator, environments, kept, drawn.order)
     shown, about = shown_part(scene, environments, sensor, drawn)
-    text = page_text(title, packed(about | header, shown | arrays, DIFFERENCES))
+    text = page_text("index", SCRIPTS, title, packed(about | header, shown | arrays, DIFFERENCES))
     return Page(text, played, tuple(about["notes"]))
 
 
@@ -245,12 +222,3 @@ def _row_arrays(truncated: TruncatedClusters, order: NDArray[np.int64]) -> dict[
         "weights": weights[:, :, order],
         "clusterColours": colours[labels[order]],
     }
-
-
-def page_text(title: str, data: str) -> str:
-    """HTML of a page around its archive."""
-    folder = files(__package__) / "page"
-    script = "\n".join((folder / f"{name}.js").read_text() for name in SCRIPTS)
-    style = (folder / "style.css").read_text()
-    template = Template((folder / "index.html").read_text())
-    return template.substitute(title=html.escape(title), style=style, script=script, data=data)

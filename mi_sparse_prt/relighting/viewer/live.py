@@ -16,7 +16,8 @@ from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.relighting.viewer import page_scene
 from mi_sparse_prt.relighting.viewer.answers import Answers
 from mi_sparse_prt.relighting.viewer.archive import packed
-from mi_sparse_prt.relighting.viewer.export import DIFFERENCES, KEPT, page_text, played_part, shown_part
+from mi_sparse_prt.relighting.viewer.export import DIFFERENCES, KEPT, SCRIPTS, played_part, shown_part
+from mi_sparse_prt.relighting.viewer.page_file import page_text
 from mi_sparse_prt.relighting.viewer.visible_lamps import visible_lamps
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -103,7 +104,7 @@ def make_live_page(
     if lamps is not None:
         header |= {"lamps": list(transport.lights), "backgroundLamp": lamps.background_lamp}
     header |= {"live": True, "errors": _mesh_errors(transport)}
-    text = page_text(title, packed(about | header, arrays, DIFFERENCES))
+    text = page_text("index", SCRIPTS, title, packed(about | header, arrays, DIFFERENCES))
     answers = Answers(scene, transport, lights, drawn.order, lamps)
     return LivePage(text, answers, about["camera"], tuple(lights), tuple(about["notes"]))
 

@@ -281,12 +281,6 @@ function pointers(viewer, canvas) {
   }, { passive: false });
 }
 
-function say(text) {
-  const sentence = document.getElementById("sentence");
-  sentence.textContent = text;
-  sentence.hidden = !text;
-}
-
 function dropped(viewer) {
   document.addEventListener("dragover", (event) => event.preventDefault());
   document.addEventListener("drop", async (event) => {
@@ -305,12 +299,6 @@ async function openLight(viewer, file) {
   } catch (error) {
     say(`${file.name}: ${error.message}`);
   }
-}
-
-function save(blob, name) {
-  const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
 // A film of what is seen, from one call to the next
