@@ -52,12 +52,17 @@ def browser(*arguments: str):
 
 def open_page(driver, address: str) -> None:
     """The viewer is ``v`` then, and frames are made by tests."""
+    assert opens(driver, address)
+    driver.execute_script("v.pinned = v.held = true; v.resize(...arguments);", *SIZE)
+
+
+def opens(driver, address: str) -> bool:
+    """Whether a page has what it needs; what it makes of itself is ``v`` then."""
     driver.get("about:blank")
     driver.get(address)
-    assert driver.execute_async_script(
+    return driver.execute_async_script(
         "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(viewer !== null); });"
     )
-    driver.execute_script("v.pinned = v.held = true; v.resize(...arguments);", *SIZE)
 
 
 def picture(driver, script: str = "", *arguments) -> np.ndarray:
@@ -67,6 +72,11 @@ def picture(driver, script: str = "", *arguments) -> np.ndarray:
         + "; if (v.changed) v.relight('everything'); v.draw(true); return v.picture.canvas.toDataURL('image/png');",
         *arguments,
     )
+    return pixels_of(text)
+
+
+def pixels_of(text: str) -> np.ndarray:
+    """Pixels (height, width, 3) of a PNG (data:), 0 to 1."""
     stream = mi.MemoryStream()
     stream.write(base64.b64decode(text.split(",")[1]))
     stream.seek(0)
