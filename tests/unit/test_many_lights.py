@@ -546,3 +546,21 @@ def test_layers_of_emitters_add_up_to_the_image(method: str) -> None:
     alone = prt.render_many_lights(room(lamp=None, point=point), method=method, **asked)
     assert found.layers["point"].mean() == pytest.approx(alone.image.mean(), rel=0.02)
     assert not prt.render_many_lights(scene, method=method, **SMALL).layers
+
+
+def test_what_is_seen_of_each_emitter_adds_up(matrix: Elements) -> None:
+    """Two lamps and a sky, seen at once, through glass and in a coat; a point that nobody sees."""
+    glass = {"type": "sphere", "center": [0.8, 0.6, 1], "radius": 0.5, "bsdf": {"type": "dielectric"}}
+    coated = FLOOR | {"bsdf": {"type": "plastic"}}
+    lamp, other = (LAMP | {"to_world": T().translate([x, 1, -0.5]).scale(0.3)} for x in (-0.9, 0.9))
+    more = {"sky": {"type": "constant", "radiance": 0.1}, "point": {"type": "point", "position": [1, 2, 1]}}
+    scene = room(glass=glass, floor=coated, lamp=lamp, other=other, **more)
+    samples = Samples(scene, Surfaces(scene), scene.sensors()[0], 4, 5, 0, apart=True)
+    names = [emitter.class_name() for emitter in scene.emitters()]
+    assert sorted(names[k] for k in samples.seen_of) == [
+        "AreaLight",
+        "AreaLight",
+        "ConstantBackgroundEmitter",
+    ]
+    assert sum(samples.seen_of.values()) == pytest.approx(samples.seen, abs=1e-5)
+    assert not matrix.samples.seen_of
