@@ -9,7 +9,8 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]  # the checkout's own package, installed or not
 
 import mi_sparse_prt  # noqa: E402
-from mi_sparse_prt.relighting.viewer.export import page_text  # noqa: E402
+from mi_sparse_prt.relighting.viewer.export import SCRIPTS  # noqa: E402
+from mi_sparse_prt.relighting.viewer.page_file import page_text  # noqa: E402
 
 project = "mi-sparse-prt"
 author = "the authors of mi-sparse-prt"
@@ -42,7 +43,7 @@ html_title = "mi-sparse-prt"
 EXTRA = HERE.parent / "build" / "extra"  # pages of other kinds, copied as they are
 (EXTRA / "live").mkdir(parents=True, exist_ok=True)
 (EXTRA / "live" / "terrace.html").write_text(
-    page_text("terrace", (HERE / "live" / "terrace.txt").read_text())
+    page_text("index", SCRIPTS, "terrace", (HERE / "live" / "terrace.txt").read_text())
 )
 html_extra_path = [str(EXTRA)]
 html_static_path = ["_static"]

@@ -15,6 +15,7 @@ from mi_sparse_prt.core.metrics import relative_l2
 from mi_sparse_prt.io.exr_layers import layers_bytes, read_layers
 from mi_sparse_prt.relighting.viewer import make_mixer
 from mi_sparse_prt.relighting.viewer import mixer as mixer_module
+from mi_sparse_prt.relighting.viewer.server import PageServer
 
 T = mi.ScalarTransform4f
 
@@ -158,6 +159,21 @@ def test_layers_that_no_page_can_mix(monkeypatch) -> None:
     monkeypatch.setattr(mixer_module, "MOST_BYTES", 100)
     with pytest.raises(prt.PrtError, match="3 layers of 9 x 6 pixels are .*smaller picture"):
         make_mixer(some_layers())
+
+
+def test_view_serves_a_mixer(tmp_path, monkeypatch) -> None:
+    served = []
+
+    def asked_once(server: PageServer) -> None:
+        served.append(server.page.decode())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PageServer, "serve_forever", asked_once)
+    layers, picture = some_layers(), tmp_path / "a.exr"
+    picture.write_bytes(layers_bytes(found_of(layers).image, layers))
+    result = call("view", picture, "--no-browser")
+    assert result.exit_code == 130 and "http://127.0.0.1:" in result.stderr
+    assert served == [make_mixer(read_layers(picture), "a").text]
 
 
 def test_view_exports_a_mixer_or_says_why_not(tmp_path) -> None:
