@@ -36,41 +36,26 @@ class ReducedColumns(NamedTuple):
         Of the columns before that.
     channel_norms : (n, 3) float64
         Of each channel.
-    rows : (r,) int64
-        Which rows these are.
-    kept : (r, n) float16
-        2-norms of RGB, relative to the largest of their row.
-    scales : (r,) float32
-        The largest of each row.
     """
 
     projected: Floats
     norms: NDArray[np.float64]
     channel_norms: NDArray[np.float64]
-    rows: NDArray[np.int64]
-    kept: NDArray[np.float16]
-    scales: Floats
 
     def of_lights(self, ids: Ids) -> ReducedColumns:
         """The columns of some lights."""
         return self._replace(
-            projected=self.projected[ids],
-            norms=self.norms[ids],
-            channel_norms=self.channel_norms[ids],
-            kept=self.kept[:, ids],
+            projected=self.projected[ids], norms=self.norms[ids], channel_norms=self.channel_norms[ids]
         )
 
 
 class _Chosen(NamedTuple):
-    """Columns and their weights on the device, slice after slice, and where the columns of each sample begin."""
+    """Columns and weights on the device, set after set; samples of lanes, and where the columns of each begin."""
 
     columns: mi.UInt32
     weights: mi.Color3f
-    starts: mi.UInt32 | None
-
-    def start(self, samples: mi.UInt32) -> mi.UInt32:
-        """Of samples."""
-        return mi.UInt32(0) if self.starts is None else dr.gather(mi.UInt32, self.starts, samples)
+    samples: mi.UInt32
+    starts: mi.UInt32
 
 
 class Elements:
@@ -127,19 +112,15 @@ class Elements:
         """Whole columns (m, len(ids), 3)."""
         return self.block(np.arange(self.shape[0]), ids)
 
-    def sum_columns(
-        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
-    ) -> Floats:
+    def sum_columns(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Floats:
         """Sums (m, 3) of columns, each times its colour, without keeping any.
 
         Parameters
         ----------
-        ids : (k,) or (n_slices, k) integers
-            Columns, of each slice of samples its own ones.
-        weights : (k, 3) or (n_slices, k, 3) float32
+        ids : (k,) or (sets, k) integers
+            Columns; where there are several sets of them, those of a pixel's samples in turn.
+        weights : (k, 3) or (sets, k, 3) float32
         done : callable
-        slices : (m,) integers, optional
-            To which slice each sample belongs.
 
         Raises
         ------
@@ -147,39 +128,33 @@ class Elements:
             An element is not finite: sample and light are named.
         """
         m, count = len(self.samples), np.shape(ids)[-1]
-        total = dr.zeros(mi.Color3f, m)
         if not m or not count:
             return np.zeros((m, 3), np.float32)
-        chosen, lane = _chosen(ids, weights, slices, m), dr.arange(mi.UInt32, m)
+        chosen, total = self._chosen(ids, weights), dr.zeros(mi.Color3f, m)
         for first, size in _pieces(count, max(1, LANES // m)):
-            total = self._accumulated(total, lane, chosen, first, size)
+            total = self._accumulated(total, chosen, first, size)
             dr.eval(total)
             dr.sync_thread()  # so that progress is that of rays
             done(size)
         self.evaluated += m * count
-        found = np.ascontiguousarray(total.numpy().T)
-        self._check_sum(found, np.unique(ids))
-        return found
+        return self._by_sample(total, chosen, np.unique(ids))
 
     def sum_of_rows(self, first: int, count: int) -> Floats:
         """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
         n = len(self.lights)
-        lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        chosen = _chosen(np.arange(n), np.ones((n, 3), np.float32), None, count)
+        chosen = _on_device(np.arange(n), np.ones((n, 3), np.float32), np.arange(first, first + count))
         found = np.zeros((count, 3))
         for start, size in _pieces(n, max(1, LANES // max(count, 1))):
-            part = self._accumulated(dr.zeros(mi.Color3f, count), lane, chosen, start, size)
+            part = self._accumulated(dr.zeros(mi.Color3f, count), chosen, start, size)
             found += part.numpy().T
         self.evaluated += n * count
         self._check_sum(found.astype(np.float32), np.arange(n), first)
         return found.astype(np.float32)
 
-    def each_column(
-        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
-    ) -> Iterator[Floats]:
+    def each_column(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Iterator[Floats]:
         """The columns (m, 3) that ``sum_columns`` adds up, one after the other."""
         m, total = len(self.samples), np.shape(ids)[-1]
-        chosen = _chosen(ids, weights, slices, m)
+        chosen = self._chosen(ids, weights)
         for first, count in _pieces(total, max(1, LANES // max(m, 1))):
             found = self._kept(chosen, first, count).numpy().reshape(3, count, m)
             self.evaluated += m * count
@@ -190,17 +165,16 @@ class Elements:
                 yield values
 
     def sum_pairs(
-        self, ids: Ids, weights: Floats, done: Done = lambda _: None, slices: Ids | None = None
+        self, ids: Ids, weights: Floats, done: Done = lambda _: None
     ) -> tuple[Floats, NDArray[np.float64]]:
         """Sums of the means of pairs of columns (m, 3), and how far apart those of each pair are.
 
         Parameters
         ----------
-        ids : (n_slices, 2 k) integers
+        ids : (sets, 2 k) integers
             Both columns of a pair follow each other.
-        weights : (n_slices, 2 k, 3) float32
-        done, slices
-            As for ``sum_columns``.
+        weights : (sets, 2 k, 3) float32
+        done : callable
 
         Returns
         -------
@@ -209,7 +183,7 @@ class Elements:
             Of the differences, as the means of pixels have them, over pixels and channels.
         """
         m, pairs = len(self.samples), np.shape(ids)[-1] // 2
-        chosen, total = _chosen(ids, weights, slices, m), dr.zeros(mi.Color3f, m)
+        chosen, total = self._chosen(ids, weights), dr.zeros(mi.Color3f, m)
         squares = np.zeros(pairs)
         for a in range(0, pairs, step := max(1, LANES // m)):
             count = min(step, pairs - a)
@@ -220,9 +194,7 @@ class Elements:
                 squares[a + k] = np.square(means, dtype=np.float64).sum()
             done(2 * count)
         self.evaluated += 2 * m * pairs
-        found = np.ascontiguousarray(total.numpy().T)
-        self._check_sum(found, np.unique(ids))
-        return found, squares
+        return self._by_sample(total, chosen, np.unique(ids)), squares
 
     def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
         """All columns at some rows, projected as soon as they are known ([HPB07] 4).
@@ -240,7 +212,6 @@ class Elements:
         """
         n = len(self.lights)
         projected = np.zeros((n, projection.shape[1]), np.float32)
-        kept, scales = np.zeros((len(rows), n), np.float16), np.zeros(len(rows), np.float32)
         squares = [dr.zeros(mi.Float, n) for _ in range(3)]
         if n and len(rows):
             receivers = self.samples.receivers(mi.UInt32(np.asarray(rows, np.uint32)))
@@ -249,19 +220,15 @@ class Elements:
         for a in range(0, len(rows) if n else 0, step):
             count = min(step, len(rows) - a)
             norms, squares = self._norms(receivers, a, count, squares)
-            block = norms.numpy().reshape(count, n).copy()
+            block = norms.numpy().reshape(count, n)
             self._check_rows(block, np.asarray(rows)[a : a + count])
             for b in range(0, count, ROWS):
                 own = slice(b, min(b + ROWS, count))
                 projected += block[own].T @ projection[a + own.start : a + own.stop]
-            scales[a : a + count] = block.max(axis=1)
-            np.divide(block, np.maximum(block.max(axis=1, keepdims=True), 1e-30), out=block)
-            kept[a : a + count] = block
             done(count)
         self.evaluated += n * len(rows)
         channels = np.stack([square.numpy() for square in squares], axis=1).astype(np.float64)
-        ids = np.asarray(rows, np.int64)
-        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels), ids, kept, scales)
+        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels))
 
     def element(self, at: Receivers, light: LightArrays, active: mi.Mask) -> mi.Color3f:
         """Radiance of one light at one sample in each lane."""
@@ -320,15 +287,13 @@ class Elements:
         return dr.select(active, value * share, 0)
 
     @dr.syntax
-    def _accumulated(
-        self, total: mi.Color3f, samples: mi.UInt32, chosen: _Chosen, first: mi.UInt32, count: int
-    ) -> mi.Color3f:
+    def _accumulated(self, total: mi.Color3f, chosen: _Chosen, first: mi.UInt32, count: int) -> mi.Color3f:
         """A lane for each sample; the lights are a loop inside of the kernel."""
-        at, start = self.samples.receivers(samples), chosen.start(samples)
+        at = self.samples.receivers(chosen.samples)
         total, k, last = mi.Color3f(total), mi.UInt32(first), first + dr.opaque(mi.UInt32, count)
         while k < last:
-            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
-            factor = dr.gather(mi.Color3f, chosen.weights, start + k)
+            light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, chosen.starts + k))
+            factor = dr.gather(mi.Color3f, chosen.weights, chosen.starts + k)
             total += factor * self.element(at, light, mi.Mask(True))
             k += 1
         return total
@@ -337,14 +302,13 @@ class Elements:
     def _kept(self, chosen: _Chosen, first: mi.UInt32, count: int) -> mi.Color3f:
         """The same, each light's values after those of the one before: (count * m)."""
         m = len(self.samples)
-        lane = dr.arange(mi.UInt32, m)
-        at, start = self.samples.receivers(lane), chosen.start(lane) + first
+        at, start = self.samples.receivers(chosen.samples), chosen.starts + first
         found = dr.zeros(mi.Color3f, m * count)
         k, last = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, count)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
             factor = dr.gather(mi.Color3f, chosen.weights, start + k)
-            dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * m + lane)
+            dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * m + chosen.samples)
             k += 1
         dr.eval(found)
         return found
@@ -355,15 +319,14 @@ class Elements:
     ) -> tuple[mi.Color3f, mi.Color3f]:
         """Means of pairs of columns added up, and their differences (count * m)."""
         m = len(self.samples)
-        lane = dr.arange(mi.UInt32, m)
-        at, start = self.samples.receivers(lane), chosen.start(lane) + dr.opaque(mi.UInt32, 2 * first)
+        at, start = self.samples.receivers(chosen.samples), chosen.starts + dr.opaque(mi.UInt32, 2 * first)
         total, apart = mi.Color3f(total), dr.zeros(mi.Color3f, m * count)
         k, last, before = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 2 * count), mi.Color3f(0)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
             value = dr.gather(mi.Color3f, chosen.weights, start + k) * self.element(at, light, mi.Mask(True))
             total += 0.5 * value
-            dr.scatter(apart, before - value, (k >> 1) * m + lane, (k & 1) == 1)
+            dr.scatter(apart, before - value, (k >> 1) * m + chosen.samples, (k & 1) == 1)
             before = mi.Color3f(value)
             k += 1
         dr.eval(total, apart)
@@ -391,6 +354,20 @@ class Elements:
         dr.eval(norms, x, y, z)
         return norms, [x, y, z]
 
+    def _chosen(self, ids: Ids, weights: Floats) -> _Chosen:
+        """For all samples, those of a set after each other, so that neighbours ask for the same light."""
+        sets, count = np.shape(np.atleast_2d(ids))
+        own = self.samples.ids % sets
+        samples = np.argsort(own, kind="stable")
+        return _on_device(ids, weights, samples, own[samples] * count)
+
+    def _by_sample(self, total: mi.Color3f, chosen: _Chosen, columns: Ids) -> Floats:
+        """Sums (m, 3) in the order of samples."""
+        found = np.empty((len(self.samples), 3), np.float32)
+        found[chosen.samples.numpy()] = total.numpy().T
+        self._check_sum(found, columns)
+        return found
+
     def _check_sum(self, found: Floats, columns: Ids, first: int = 0) -> None:
         bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
         if len(bad):
@@ -416,8 +393,8 @@ def _pieces(count: int, size: int) -> Iterator[tuple[mi.UInt32, int]]:
         yield dr.opaque(mi.UInt32, first), min(size, count - first)
 
 
-def _chosen(ids: Ids, weights: Floats, slices: Ids | None, samples: int) -> _Chosen:
+def _on_device(ids: Ids, weights: Floats, samples: Ids, starts: Ids | None = None) -> _Chosen:
     colours = np.ascontiguousarray(np.asarray(weights, np.float32).reshape(-1, 3).T)
-    starts = None if slices is None else mi.UInt32((slices * np.shape(ids)[-1]).astype(np.uint32))
-    assert slices is None or len(slices) == samples
-    return _Chosen(mi.UInt32(np.ravel(ids).astype(np.uint32)), mi.Color3f(colours), starts)
+    first = np.zeros(len(samples)) if starts is None else starts
+    columns, lanes, places = (mi.UInt32(np.ravel(x).astype(np.uint32)) for x in (ids, samples, first))
+    return _Chosen(columns, mi.Color3f(colours), lanes, places)

@@ -22,13 +22,10 @@ from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
     SECOND,
     Estimate,
-    LocalPartitions,
     Partition,
     defensive_partition,
     draw_coloured_representatives,
-    everywhere,
     published_partition,
-    refined,
     sum_with_error,
 )
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
@@ -46,13 +43,9 @@ _PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
 
 PILOT = 16  # rows, and columns, that tell what others cost
 CLUSTERING = 7e-9  # seconds for each light and cluster
-ROWS_PER_SLICE = 16  # at least, where samples are apart in slices, with clusters of their own
-SLICES = 20  # at most
-GLOBAL = 0.6  # of the clusters are found for all samples
 EARLY = 9  # times fewer columns for a preview
 RESERVE = 0.05  # of a time budget
 
-Clusters = Partition | LocalPartitions
 View = tuple[mi.Scene, mi.Sensor]
 
 
@@ -314,8 +307,8 @@ class RowColumn:
 
     def partition(
         self, reduced: ReducedColumns, columns: int, ids: NDArray[np.int64] | None = None
-    ) -> Clusters:
-        """Clusters by the method; of ``adaptive``, a part of them is refined for slices of samples.
+    ) -> Partition:
+        """Clusters by the method.
 
         Parameters
         ----------
@@ -331,28 +324,22 @@ class RowColumn:
             found = self._partition(reduced.of_lights(ids), columns, self.lights.flux[ids])
             return found.numbered(ids, len(self.lights))
 
-    def _partition(self, reduced: ReducedColumns, columns: int, flux: NDArray[np.float64]) -> Clusters:
+    def _partition(self, reduced: ReducedColumns, columns: int, flux: NDArray[np.float64]) -> Partition:
         rng = self.settings.random(_CLUSTER)
         if self.settings.method == "hasan2007":
             return published_partition(reduced, columns, rng)
-        slices = min(len(reduced.rows) // ROWS_PER_SLICE, SLICES)
-        globally = columns if slices < 2 else max(1, round(GLOBAL * columns))
-        partition = defensive_partition(reduced, flux, globally, rng)
-        if slices < 2:
-            return everywhere(partition, len(self.samples))
-        labels, rows_of = self.samples.slices(reduced.rows, slices, self.lights.radius)
-        return refined(partition, reduced, labels, rows_of, columns, rng)
+        return defensive_partition(reduced, flux, columns, rng)
 
-    def summed(self, reduced: ReducedColumns, partition: Clusters) -> Estimate:
+    def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
         """The sum of all columns by those that represent their clusters."""
         rng = self.settings.random(_DRAW)
-        published = isinstance(partition, Partition)
+        published = self.settings.method == "hasan2007"
         total = len(partition) if published else round((1 + SECOND) * len(partition))
         with self.run.clock.phase("columns"), self.run.bar(total, "columns", " columns") as bar:
-            if isinstance(partition, Partition):
+            if published:
                 chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
-            return sum_with_error(self.elements, partition, rng, bar.update)
+            return sum_with_error(self.elements, partition, self.settings.spp, rng, bar.update)
 
     def estimate(self, preview: Callable[[Floats], object] | None = None) -> Estimate:
         """All steps; within a time budget, rows and columns by what a few of them cost."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
@@ -23,8 +21,6 @@ from mi_sparse_prt.scene.instances import placed_shapes
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
 _CAMERA, _COATS = 0x5A17, 0x5A18  # keys of random numbers
-
-LEAST_ROWS = 12  # of a slice of samples
 
 Floats = NDArray[np.float32]
 Ids = NDArray[np.int64]
@@ -199,50 +195,6 @@ class Samples:
         """The first row of each pixel that has some."""
         return np.unique(self.ids // self.spp, return_index=True)[1]
 
-    def slices(self, rows: NDArray[np.integer], count: int, radius: float) -> tuple[Ids, list[Ids]]:
-        """Samples that lie near each other and face alike, in slices around some rows.
-
-        Parameters
-        ----------
-        rows : (r,) integers
-        count : int
-            Slices, at most.
-        radius : float
-            Of the scene: normals that are at right angles count as much as half of it.
-
-        Returns
-        -------
-        slices : (m,) int64
-        rows_of : list of (k,) int64
-            Of each slice, the rows that tell most about it, by their places in ``rows``: at least ``LEAST_ROWS``.
-        """
-        features = self._features(radius)
-        own = features[rows]
-        start = own[np.random.default_rng([len(rows), _CAMERA]).choice(len(rows), count, replace=False)]
-        with warnings.catch_warnings():  # an empty slice is left out
-            warnings.simplefilter("ignore", UserWarning)
-            centres, label = kmeans2(own, start, minit="matrix")
-        centres = centres[np.unique(label)]
-        nearest = np.concatenate(
-            [
-                _squared_distances(part, centres).argmin(axis=1)
-                for part in np.array_split(features, max(1, len(features) >> 16))
-            ]
-        )
-        away = _squared_distances(own, centres)
-        nearest_of_row = away.argmin(axis=1)
-        rows_of = []
-        for k in range(len(centres)):
-            order = np.argsort(away[:, k], kind="stable")
-            rows_of.append(np.union1d(np.flatnonzero(nearest_of_row == k), order[:LEAST_ROWS]))
-        return nearest, rows_of
-
-    def _features(self, radius: float) -> Floats:
-        si = self._hit.compute_surface_interaction(self._ray)
-        normal = dr.mulsign(mi.Vector3f(si.sh_frame.n), mi.Frame3f.cos_theta(si.wi))
-        found = np.concatenate([si.p.numpy() / radius, normal.numpy() * np.float32(0.25 * np.sqrt(2))])
-        return np.ascontiguousarray(found.T, np.float32)
-
     def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
         """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.
 
@@ -300,11 +252,6 @@ class _SeenOf:
         """Sums (samples, 3) by the numbers of emitters, without those that nobody sees."""
         sums = self._sums.numpy().reshape(-1, self._count, 3)
         return {number: own for number, own in zip(self._emitters, sums, strict=False) if own.any()}
-
-
-def _squared_distances(x: Floats, centres: Floats) -> Floats:
-    """(n, k), but for what depends on x alone."""
-    return (centres**2).sum(axis=1) - 2 * (x @ centres.T)
 
 
 def _camera_rays(sensor: mi.Sensor, places: Floats, seed: int) -> tuple[mi.Ray3f, mi.Color3f, mi.PCG32]:

@@ -1,6 +1,7 @@
 """Many lights: lights of a scene, samples, elements, estimates; small, and where possible against brute force."""
 
 import json
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -14,13 +15,13 @@ from mi_sparse_prt.manylights import elements as elements_module
 from mi_sparse_prt.manylights.baselines import all_lights, draw_by_power, instant_radiosity
 from mi_sparse_prt.manylights.elements import Elements, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
+    Estimate,
     Partition,
+    Representatives,
     defensive_partition,
     draw_coloured_representatives,
     draw_representatives,
-    everywhere,
     published_partition,
-    refined,
     sum_with_error,
 )
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
@@ -76,13 +77,9 @@ def whole(matrix: Elements) -> np.ndarray:
 
 
 def reduced_from(whole: np.ndarray, rows: np.ndarray) -> ReducedColumns:
-    own = whole[rows]
-    norms = np.linalg.norm(own, axis=2)  # [row, light]
-    scales = norms.max(axis=1)
-    kept = (norms / np.maximum(scales, 1e-30)[:, None]).astype(np.float16)
-    channels = np.linalg.norm(own, axis=0)
-    found = norms.T.astype(np.float32), np.linalg.norm(channels, axis=1), channels
-    return ReducedColumns(*found, rows, kept, scales.astype(np.float32))
+    norms = np.linalg.norm(whole[rows], axis=2).T.astype(np.float32)  # [light, row]
+    channels = np.linalg.norm(whole[rows], axis=0)
+    return ReducedColumns(norms, np.linalg.norm(channels, axis=1), channels)
 
 
 # -- elements ---------------------------------------------------------------------------------------------------------
@@ -98,10 +95,13 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
     for each, column, weight in zip(matrix.each_column(columns, weights), columns, weights, strict=True):
         assert each == pytest.approx(whole[:, column] * weight, rel=1e-5, abs=1e-7)
     ids, twos = np.array([columns, columns[::-1]]), np.array([weights, weights[::-1]])
-    slices = (np.arange(len(matrix.samples)) > 100).astype(np.int64)
-    sums, squares = matrix.sum_pairs(ids, twos, slices=slices)
+    own = (matrix.samples.ids % 2)[:, None]
+    mixed = matrix.sum_columns(ids * [[1], [0]], twos)  # the second set is four times column 0
+    others = whole[:, 0] * weights.sum(axis=0)
+    assert mixed == pytest.approx(np.where(own, others, expected), rel=1e-5, abs=1e-7)
+    sums, squares = matrix.sum_pairs(ids, twos)
     assert sums == pytest.approx(expected / 2, rel=1e-5, abs=1e-7)
-    signs = np.where(slices, -1, 1)[:, None]
+    signs = np.where(own, -1, 1)
     pixel = matrix.samples.ids // 4
     for k, (i, j) in enumerate(((0, 1), (2, 3))):
         apart = [
@@ -109,7 +109,7 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
             for a, b in ((i, j), (3 - i, 3 - j))
         ]
         means = np.zeros((256, 3))
-        np.add.at(means, pixel, np.where(slices[:, None] > 0, -apart[1], apart[0]) / 4)
+        np.add.at(means, pixel, np.where(own, -apart[1], apart[0]) / 4)
         assert squares[k] == pytest.approx((means**2).sum(), rel=1e-4)
     assert matrix.sum_of_rows(10, 30) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
 
@@ -183,7 +183,8 @@ def test_the_mean_of_estimates_is_the_sum_of_all_columns(whole: np.ndarray, fixe
             reduced = reduced_from(whole, rows)
             assert not fixed or (reduced.norms == 0).any()
             partitions.append(defensive_partition(reduced, flux, 40, rng))
-        return draw_representatives(partitions[-1], rng)
+        sets = draw_representatives(partitions[-1], 3, rng)
+        return Representatives(sets.ids[k % 3], sets.weights[k % 3])
 
     bias, error = deviation(estimates(whole, draw, 1000), whole)
     assert error < 0.003 and abs(bias) < 4 * error, (bias, error)
@@ -218,44 +219,62 @@ def test_a_representative_without_a_channel_keeps_its_scale() -> None:
         assert chosen.weights[0] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("slices", [1, 3])
-def test_the_predicted_error_is_that_of_the_image(matrix: Elements, whole: np.ndarray, slices: int) -> None:
+def test_sets_of_representatives_are_apart() -> None:
+    """A cluster of equal weights: each set has a light of another quarter of it, in any order, each light as often."""
+    partition = Partition([np.arange(8), np.array([8])], np.ones(9), np.zeros(2))
+    found = [draw_representatives(partition, 4, np.random.default_rng(seed)) for seed in range(400)]
+    first = np.array([chosen.ids[:, 0] for chosen in found])  # [seed, set]
+    assert np.array_equal(np.sort(first // 2, axis=1), np.tile(np.arange(4), (400, 1)))
+    often = np.array([np.bincount(first[:, k], minlength=8) for k in range(4)]) / 400
+    assert often == pytest.approx(np.full((4, 8), 1 / 8), abs=4 * np.sqrt(7 / 64 / 400))
+    assert all((chosen.ids[:, 1] == 8).all() for chosen in found)
+    assert found[0].weights == pytest.approx(np.tile([[[8.0], [1.0]]], (4, 1, 3)))
+
+
+@pytest.mark.parametrize("sets", [1, 4])
+def test_the_predicted_error_is_that_of_the_image(matrix: Elements, whole: np.ndarray, sets: int) -> None:
     """Second representatives tell the expected error, over 200 estimates of one partition, whose mean is the truth.
 
     Rationale: that error is the sum of the variances of all clusters; a tenth of them is measured, drawn by cost and
     energy, and counts by the inverse of its chance.
-    Expected: root mean squares of predicted and true errors within 15%; both vary by few percent over so many seeds.
-    The mean of the estimates is within four standard errors, of clusters of slices, too.
+    Expected: root mean squares of predicted and true errors of pixels within 15%; both vary by few percent over so many
+    seeds. The mean of the estimates is within four standard errors. Four sets have at most 0.7 times the error of one.
     """
-    rng = np.random.default_rng(1)
-    rows = rng.choice(len(whole), 20, replace=False)
-    reduced = reduced_from(whole, rows)
-    local = everywhere(defensive_partition(reduced, np.ones(whole.shape[1]), 30, rng), len(whole))
-    if slices > 1:
-        labels, rows_of = matrix.samples.slices(rows, slices, matrix.lights.radius)
-        local = refined(local.partitions[0], reduced, labels, rows_of, 60, rng)
-        assert len(local.partitions) > 1 and {len(p) for p in local.partitions} == {60}
-    columns = whole.astype(np.float32)
+    true, sums = {}, np.zeros(200)
+    for count in {1, sets}:
+        predicted, true[count] = np.zeros(200), np.zeros(200)
+        for k, found in enumerate(estimates_with_error(matrix, whole, count)):
+            off = found.values - whole.sum(axis=1)
+            predicted[k] = found.squared_error
+            true[count][k] = (matrix.samples.pixel_means(off.T) ** 2).sum()
+            sums[k] = found.values.sum()
+        assert abs(sums.mean() - whole.sum()) < 4 * sums.std() / np.sqrt(200) < 0.02 * whole.sum()
+        assert np.sqrt(predicted.mean() / true[count].mean()) == pytest.approx(1, abs=0.15)
+    if sets > 1:
+        assert np.sqrt(true[sets].mean() / true[1].mean()) < 0.7
 
-    def each(ids, weights, slices):
+
+def estimates_with_error(matrix: Elements, whole: np.ndarray, sets: int) -> Iterator[Estimate]:
+    """200 of one partition, of a matrix that is known."""
+    columns, own = whole.astype(np.float32), matrix.samples.ids % sets
+    reduced = reduced_from(whole, np.random.default_rng(1).choice(len(whole), 20, replace=False))
+    partition = defensive_partition(reduced, np.ones(whole.shape[1]), 30, np.random.default_rng(1))
+
+    def each(ids, weights):
         for k in range(ids.shape[1]):
-            yield columns[np.arange(len(columns)), ids[slices, k]] * weights[slices, k]
+            yield columns[np.arange(len(columns)), ids[own, k]] * weights[own, k]
 
-    def sum_columns(ids, weights, done, slices):
-        return sum(each(ids, weights, slices), np.zeros_like(columns[:, 0]))
+    def sum_columns(ids, weights, done):
+        return sum(each(ids, weights), np.zeros_like(columns[:, 0]))
 
-    def sum_pairs(ids, weights, done, slices):
-        every = np.array(list(each(ids, weights, slices)))
-        return every.sum(axis=0) / 2, ((every[::2] - every[1::2]) ** 2).sum(axis=(1, 2))
+    def sum_pairs(ids, weights, done):
+        every = np.array(list(each(ids, weights)))
+        apart = [matrix.samples.pixel_means(pair.T) for pair in every[::2] - every[1::2]]
+        return every.sum(axis=0) / 2, np.array([(pixels**2).sum() for pixels in apart])
 
     twin = SimpleNamespace(sum_columns=sum_columns, sum_pairs=sum_pairs)
-    predicted, true, sums = np.zeros(200), np.zeros(200), np.zeros(200)
     for k in range(200):
-        found = sum_with_error(twin, local, np.random.default_rng(k))
-        predicted[k], true[k] = found.squared_error, ((found.values - whole.sum(axis=1)) ** 2).sum()
-        sums[k] = found.values.sum()
-    assert abs(sums.mean() - whole.sum()) < 4 * sums.std() / np.sqrt(200) < 0.02 * whole.sum()
-    assert np.sqrt(predicted.mean() / true.mean()) == pytest.approx(1, abs=0.15)
+        yield sum_with_error(twin, partition, sets, np.random.default_rng(k))
 
 
 def test_power_sampling_is_unbiased(whole: np.ndarray) -> None:
@@ -269,46 +288,11 @@ def test_with_as_many_clusters_as_lights_nothing_is_lost(matrix: Elements, whole
     partition = defensive_partition(
         reduced_from(whole, rows), matrix.lights.flux, 10 * whole.shape[1], np.random.default_rng(0)
     )
-    found = sum_with_error(matrix, everywhere(partition, len(whole)), np.random.default_rng(1))
+    found = sum_with_error(matrix, partition, 4, np.random.default_rng(1))
     assert len(partition) <= whole.shape[1]
     every = [len(own) for own in partition.clusters]
     if max(every) == 1:
         assert found.values == pytest.approx(whole.sum(axis=1), rel=1e-4) and found.squared_error == 0
-
-
-def test_clusters_of_slices_are_better_where_global_ones_are_not(small_room: mi.Scene, matrix, whole) -> None:
-    """The same number of columns with clusters of their own for each slice of samples.
-
-    Rationale: what lights do differs from place to place; a global cluster is a compromise.
-    Expected: over 20 seeds, the expected squared error, by the clusters' costs in the whole matrix, is below that of
-    global clusters.
-    """
-    exact = np.linalg.norm(whole, axis=2)  # [sample, light]
-    errors = np.zeros((2, 20))
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        rows = rng.choice(len(whole), 60, replace=False)
-        reduced = reduced_from(whole, rows)
-        everything = defensive_partition(reduced, matrix.lights.flux, 40, rng)
-        labels, rows_of = matrix.samples.slices(rows, 4, matrix.lights.radius)
-        part = defensive_partition(reduced, matrix.lights.flux, 24, rng)
-        local = refined(part, reduced, labels, rows_of, 40, rng)
-        for k, found in enumerate((everywhere(everything, len(whole)), local)):
-            errors[k, seed] = sum(
-                expected_error(exact[found.slices == s], p) for s, p in enumerate(found.partitions)
-            )
-    ratio = errors[1].mean() / errors[0].mean()
-    print(f"squared error of slices / global: {ratio:.2f}")
-    assert ratio < 0.9
-
-
-def expected_error(columns: np.ndarray, partition: Partition) -> float:
-    """E|X - E X|^2 of one representative of each cluster, of columns (m, n)."""
-    total = 0.0
-    for own in partition.clusters:
-        p = partition.drawing[own] / partition.drawing[own].sum()
-        total += ((columns[:, own] ** 2).sum(axis=0) / p).sum() - (columns[:, own].sum(axis=1) ** 2).sum()
-    return total
 
 
 # -- baselines --------------------------------------------------------------------------------------------------------
