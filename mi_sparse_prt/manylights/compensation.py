@@ -9,6 +9,7 @@ ends there, which makes it cheap.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ from mi_sparse_prt.manylights.clamping import kept, receiving, sending
 from mi_sparse_prt.manylights.elements import Done, Elements, Floats
 from mi_sparse_prt.manylights.light_arrays import facing, reflected
 from mi_sparse_prt.manylights.particles import next_2d
-from mi_sparse_prt.manylights.samples import Receivers
+from mi_sparse_prt.manylights.samples import Receivers, Samples
 from mi_sparse_prt.manylights.surfaces import BENT
 from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
@@ -59,9 +60,38 @@ class LeftOut:
         """Both kinds together (k, 3)."""
         return self.clamped + self.specular
 
+    def of_image(self, samples: Samples) -> dict[str, tuple[float, float]]:
+        """What each kind adds to the mean radiance of the image, and the standard error (at most) of that.
+
+        It is that of the paths of all samples, or of these samples among all.
+        """
+        count, found = len(self.rows), {}
+        share = len(samples) / max(len(samples.seen), 1)
+        for k, (name, values) in enumerate((("clamped", self.clamped), ("specular", self.specular))):
+            means = values.mean(axis=1, dtype=np.float64)
+            within = self.variances[:, k].sum() / 3 / max(count, 1) ** 2  # as if channels were equal
+            variance = within if count == len(samples) and within else means.var() / max(count, 1)
+            found[name] = (share * float(means.sum()) / max(count, 1), share * float(np.sqrt(variance)))
+        return found
+
+
+def joined(parts: Sequence[LeftOut]) -> LeftOut:
+    """The sum of what independent paths from the same samples found."""
+    return LeftOut(
+        parts[0].rows,
+        sum((part.clamped for part in parts[1:]), parts[0].clamped),
+        sum((part.specular for part in parts[1:]), parts[0].specular),
+        sum((part.variances for part in parts[1:]), parts[0].variances),
+    )
+
 
 def trace_left_out(
-    elements: Elements, rows: NDArray[np.integer], paths: int, seed: int, done: Done = lambda _: None
+    elements: Elements,
+    rows: NDArray[np.integer],
+    paths: int,
+    seed: int,
+    done: Done = lambda _: None,
+    emitter: int | None = None,
 ) -> LeftOut:
     """Trace some paths from samples; which ones does not depend on what other samples are asked for.
 
@@ -75,6 +105,8 @@ def trace_left_out(
     seed : int
     done : callable
         Is told how many rows more are done.
+    emitter : int, optional
+        Light of this one alone, by other paths than those of others.
 
     Raises
     ------
@@ -83,7 +115,9 @@ def trace_left_out(
     """
     means = np.zeros((2, len(rows), 3), np.float32)
     variances = np.zeros((len(rows), 3))
-    tracer, step = _Tracer(elements), max(1, LANES // paths)
+    if elements.max_depth < 3:  # direct light, of which nothing is left out
+        return LeftOut(np.asarray(rows, np.int64), means[0], means[1], variances)
+    tracer, step = _Tracer(elements, emitter), max(1, LANES // paths)
     for a in range(0, len(rows), step):
         part = slice(a, min(a + step, len(rows)))
         means[:, part], variances[part] = _block(tracer, np.asarray(rows[part], np.uint32), paths, seed)
@@ -92,7 +126,7 @@ def trace_left_out(
     if len(bad):
         name = elements.samples.name(int(rows[bad[0]]))
         raise PrtError(f"{name} is lit by paths whose light is not finite: repair the BSDFs that it sees")
-    return LeftOut(np.asarray(rows, np.int64), *means, variances)
+    return LeftOut(np.asarray(rows, np.int64), means[0], means[1], variances)
 
 
 def _block(
@@ -102,13 +136,15 @@ def _block(
     lane, count = dr.arange(mi.UInt32, len(rows) * paths), dr.opaque(mi.UInt32, paths)
     row = dr.gather(mi.UInt32, mi.UInt32(rows), lane // count)
     number = lane - lane // count * count
-    rng = random_generator(mi.UInt64(row), dr.opaque(mi.UInt32, _PATHS), number, seed)
+    rng = random_generator(mi.UInt64(row), dr.opaque(mi.UInt32, tracer.key), number, seed)
     found = tracer.trace(tracer.elements.samples.receivers(row), rng)
     kinds = [*found, found[0] + found[1]]
     squares = [dr.squared_norm(kind) for kind in kinds]
     dr.eval(kinds, squares)  # in one kernel
     sums = [dr.block_reduce(dr.ReduceOp.Add, kind, paths).numpy().T.astype(np.float64) for kind in kinds]
-    second = [dr.block_reduce(dr.ReduceOp.Add, square, paths).numpy().astype(np.float64) for square in squares]
+    second = [
+        dr.block_reduce(dr.ReduceOp.Add, square, paths).numpy().astype(np.float64) for square in squares
+    ]
     means = np.stack(sums) / paths
     around = np.stack(second) / paths - np.square(means).sum(axis=2)
     return means[:2].astype(np.float32), np.maximum(around, 0).T / max(paths - 1, 1)
@@ -129,8 +165,13 @@ class _Tracer:
     A path is linked as long as it went straight on since it left its sample: an element connects these two places.
     """
 
-    def __init__(self, elements: Elements) -> None:
+    def __init__(self, elements: Elements, emitter: int | None = None) -> None:
         self.elements, self.scene, self.surfaces = elements, elements.scene, elements.surfaces
+        self.key = _PATHS + (0 if emitter is None else 1 + emitter)
+        self._only = None
+        if emitter is not None:
+            index = dr.opaque(mi.UInt32, emitter)
+            self._only = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
 
     @dr.syntax
     def trace(self, at: Receivers, rng: mi.PCG32) -> tuple[mi.Color3f, mi.Color3f]:
@@ -139,7 +180,10 @@ class _Tracer:
         ray, throughput, depth = mi.Ray3f(start.ray), mi.Color3f(start.throughput), at.depth + 1
         most = dr.opaque(mi.UInt32, self.elements.max_depth)
         linked, specular = mi.Mask(True), mi.Mask(False)
-        before, density = mi.Point3f(at.si.p), mi.Float(0)  # of the last surface that did not pass it straight on
+        before, density = (
+            mi.Point3f(at.si.p),
+            mi.Float(0),
+        )  # of the last surface that did not pass it straight on
         clamped, bent = mi.Color3f(0), mi.Color3f(0)
         active = ~dr.all(throughput == 0) & (depth < most)
         while active:
@@ -237,7 +281,7 @@ class _Tracer:
         there = mi.DirectionSample3f(self.scene, si, origin)
         chance = self.scene.pdf_emitter_direction(origin, there, active & (density > 0))
         weight = dr.select(density > 0, _mis(density, chance), 1)
-        return dr.select(active, emitter.eval(si, active) * weight, 0)
+        return dr.select(active & self._counts(emitter), emitter.eval(si, active) * weight, 0)
 
     def _sampled_lamp(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
@@ -245,7 +289,12 @@ class _Tracer:
         """Radiance over its density from a direction towards a lamp, as if nothing was in the way."""
         lit = active & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         found, value = self.scene.sample_emitter_direction(si, next_2d(rng), False, lit)
-        return dr.select(lit & (found.pdf > 0), mi.Color3f(value), 0), found
+        lit &= (found.pdf > 0) & self._counts(found.emitter)
+        return dr.select(lit, mi.Color3f(value), 0), found
+
+    def _counts(self, emitter: mi.EmitterPtr) -> mi.Mask:
+        """Whether light of emitters is asked for."""
+        return mi.Mask(True) if self._only is None else emitter == self._only
 
     def _passed(
         self,
