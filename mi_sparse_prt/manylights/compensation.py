@@ -32,7 +32,6 @@ from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
 PATHS = 16  # of each sample
 LANES = 1 << 20  # paths of a kernel
 SURVEY = 1 << 14  # samples with a path each, which tell how much is left out
-LEAST_SURVIVAL = 0.05  # of paths, of which little is left
 _PATHS = 0x5A19  # key of random numbers
 
 
@@ -215,10 +214,9 @@ class _Tracer:
             ray = si.spawn_ray(out)
             depth += 1
 
-            # Russian roulette, by what is left at the first surface
-            survival = dr.select(share < 1, dr.maximum(share, LEAST_SURVIVAL), 1)
-            late = (depth >= ROULETTE_DEPTH) & (share == 1)
-            survival = dr.select(late, dr.minimum(dr.max(dr.abs(throughput)), 0.95), survival)
+            # Russian roulette
+            brightest = dr.max(dr.abs(throughput))
+            survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(brightest, 0.95), 1)
             active &= ~dr.all(throughput == 0) & (rng.next_float32() < survival)
             throughput /= survival
         return clamped, bent
