@@ -64,13 +64,15 @@ class LeftOut:
 
         It is that of the paths of all samples, or of these samples among all.
         """
-        count, found = len(self.rows), {}
+        count, found = max(len(self.rows), 1), {}
         share = len(samples) / max(len(samples.seen), 1)
         for k, (name, values) in enumerate((("clamped", self.clamped), ("specular", self.specular))):
             means = values.mean(axis=1, dtype=np.float64)
-            within = self.variances[:, k].sum() / 3 / max(count, 1) ** 2  # as if channels were equal
-            variance = within if count == len(samples) and within else means.var() / max(count, 1)
-            found[name] = (share * float(means.sum()) / max(count, 1), share * float(np.sqrt(variance)))
+            mean = float(means.sum()) / count
+            variance = float(self.variances[:, k].sum()) / 3 / count**2  # as if channels were equal
+            if not variance or len(means) < len(samples):
+                variance = float(np.square(means - mean).sum()) / count**2
+            found[name] = (share * mean, share * float(np.sqrt(variance)))
         return found
 
 
@@ -196,17 +198,17 @@ class _Tracer:
             value, chance, sample, weight = bsdf.eval_pdf_sample(
                 mi.BSDFContext(), si, si.to_local(towards.d), rng.next_float32(), next_2d(rng), active
             )
-            share, lost = self._left(at, start, si, towards.d, linked, active)
+            share, through = self._left(at, start, si, towards.d, linked, active)
             value *= light * (share * dr.select(towards.delta, 1, _mis(towards.pdf, chance)))
             lit = throughput * self._passed(si, towards, value, most - depth - 2, active)
-            clamped += dr.select(specular, 0, met + dr.select(lost, 0, lit))
-            bent += dr.select(specular, met + lit, dr.select(lost, lit, 0))
+            clamped += dr.select(specular, 0, met + dr.select(through, 0, lit))
+            bent += dr.select(specular, met + lit, dr.select(through, lit, 0))
 
             # next surface
             out, kind = si.to_world(sample.wo), mi.UInt32(sample.sampled_type)
             turns, straight = (kind & BENT) != 0, mi.has_flag(kind, mi.BSDFFlags.Null)
-            share, lost = self._left(at, start, si, out, linked & ~straight & ~turns, active)
-            specular |= linked & ~straight & (turns | lost)
+            share, through = self._left(at, start, si, out, linked & ~straight & ~turns, active)
+            specular |= linked & ~straight & (turns | through)
             throughput *= weight * share
             linked &= straight
             density = dr.select(straight, density, dr.select(turns, 0, sample.pdf))
@@ -248,26 +250,25 @@ class _Tracer:
         linked: mi.Mask,
         active: mi.Mask,
     ) -> tuple[mi.Float, mi.Mask]:
-        """Share of light from a direction that elements do not have; and whether they have none for another reason.
+        """Share of light from a direction that elements do not have; and whether that is as it goes through a surface.
 
-        That is so where surfaces send light through: points of light are on one side of theirs. Of paths that are not
-        linked it is the whole.
+        Points of light are on one side of theirs. Of paths that are not linked it is the whole.
         """
         line = si.p - at.si.p
         square = dr.maximum(dr.squared_norm(line), 1e-30)
         direction = line * dr.rsqrt(square)
         normal = dr.mulsign(mi.Vector3f(si.n), dr.dot(si.n, towards))
         cosine = facing(normal, direction) / square
-        sends = mi.Float(cosine)
+        sends, through = mi.Float(cosine), mi.Mask(False)
         if not self.surfaces.all_lambertian:
-            own = active & linked & (cosine > 0) & ~self.surfaces.lambertian(si)
+            glossy = active & linked & ~self.surfaces.lambertian(si)
+            own, through = glossy & (cosine > 0), glossy & (cosine <= 0)
             turned = mi.SurfaceInteraction3f(si)
             turned.wi = si.to_local(towards)
             value, scale = reflected(turned, normal, direction, square, own)
             sends = sending(cosine, dr.select(own, value, 0), scale)
         share = 1 - kept(start.receives, sends, dr.opaque(mi.Float, self.elements.clamp))
-        has_any = linked & (cosine > 0)
-        return dr.select(has_any, share, 1), linked & ~has_any
+        return dr.select(linked & (cosine > 0), share, 1), through
 
     def _met(
         self, si: mi.SurfaceInteraction3f, before: mi.Point3f, density: mi.Float, active: mi.Mask

@@ -140,19 +140,17 @@ def test_pixels_of_a_corner_are_those_of_path() -> None:
 
 
 CASES = {
-    "mirror and glass": (corner(wall=wall(MIRROR), ball=ball({"type": "dielectric"})), 5),
+    "mirror and glass": ({"wall": wall(MIRROR), "ball": ball({"type": "dielectric"})}, 5),
     "gold, a mask and plastic": (
-        corner(
-            wall=wall(GOLD),
-            ball=ball({"type": "plastic", "diffuse_reflectance": 0.6}),
-            pane=pane({"type": "mask", "opacity": 0.4, "b": GOLD}),
-        ),
+        {
+            "wall": wall(GOLD),
+            "ball": ball({"type": "plastic", "diffuse_reflectance": 0.6}),
+            "pane": pane({"type": "mask", "opacity": 0.4, "b": GOLD}),
+        },
         5,
     ),
     "rough glass and a thin pane": (
-        corner(
-            ball=ball({"type": "roughdielectric", "alpha": 0.3}), pane=pane({"type": "thindielectric"})
-        ),
+        {"ball": ball({"type": "roughdielectric", "alpha": 0.3}), "pane": pane({"type": "thindielectric"})},
         6,
     ),
 }
@@ -164,11 +162,12 @@ def test_regions_are_those_of_path(name: str) -> None:
 
     Rationale: light by way of mirrors and glass, and what rough glass lets through, counts in full, as no connection
     has it; what holes and panes let pass straight on is a connection, and counts as one; each is a bounce.
-    Expected: the mean of each quarter within 4 standard errors of 12 sets of lights, or 0.2%, and within 2%; without the
-    paths, the image has at least 2% less light than that of ``path``.
+    Expected: the mean of each quarter within 4 standard errors of 12 sets of lights, or 0.2%, and within 2%; without
+    the paths, the image has at least 2% less light than that of ``path``.
     """
-    scene, depth = CASES[name]
-    theirs, (plain, ours) = by_path(scene, depth, 6, 2048), rendered(scene, depth, 12, 1.0)
+    things, depth = CASES[name]
+    scene = corner(**things)
+    theirs, (plain, ours) = by_path(scene, depth, 6, 1024), rendered(scene, depth, 12, 1.0)
     assert plain.mean() < 0.98 * theirs.mean()
     quarters = [x.reshape(len(x), 2, SIZE // 2, 2, SIZE // 2).mean(axis=(2, 4)) for x in (ours, theirs)]
     off = quarters[0].mean(axis=0) / quarters[1].mean(axis=0) - 1
