@@ -31,7 +31,7 @@ from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
 
 PATHS = 16  # of each sample
 LANES = 1 << 20  # paths of a kernel
-SURVEY = 1 << 14  # samples with a path each, which tell how much is left out
+SURVEY = 1 << 16  # samples with a path each, which tell how much is left out
 _PATHS = 0x5A19  # key of random numbers
 
 
