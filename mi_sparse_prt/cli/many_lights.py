@@ -59,6 +59,13 @@ Clamp = Annotated[
         show_default="that of surfaces at 1/10 of the scene's radius",
     ),
 ]
+Compensate = Annotated[
+    bool,
+    typer.Option(
+        "--compensate",
+        help="Add what the clamp cuts off, and light by way of mirrors and glass: the image of path, with some grain.",
+    ),
+]
 Camera = Annotated[int, typer.Option(help="Which of the scene's sensors.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same image.")]
 Groups = Annotated[
@@ -87,6 +94,7 @@ def many_lights(
     spp: Samples = 4,
     max_depth: MaxDepth = 5,
     clamp: Clamp = None,
+    compensate: Compensate = False,
     camera: Camera = 0,
     seed: Seed = 0,
     groups: Groups = False,
@@ -134,6 +142,7 @@ def many_lights(
                 clamp=clamp,
                 seed=seed,
                 groups=groups,
+                compensate=compensate,
             )
         if groups:
             command.write(output, layers_bytes(found.image, found.layers))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.manylights.clamping import kept, receiving
 from mi_sparse_prt.manylights.light_arrays import DIRECTION, LightArrays, arriving
 from mi_sparse_prt.manylights.lights import Lights
 from mi_sparse_prt.manylights.samples import Receivers, Samples
@@ -76,7 +77,8 @@ class Elements:
     def __init__(self, scene: mi.Scene, surfaces: Surfaces, samples: Samples, lights: Lights) -> None:
         self.scene, self.surfaces, self.samples, self.lights = scene, surfaces, samples, lights
         depth = samples.max_depth
-        self._max_depth = depth if depth >= 0 else 1 << 30
+        self.max_depth = depth if depth >= 0 else 1 << 30
+        self.clamp = min(lights.clamp, 1e30)
         self.evaluated = 0
 
     @property
@@ -243,7 +245,7 @@ class Elements:
         The geometry term of indirect lights is at most ``lights.clamp``, times what either BSDF has more than a white
         diffuse one.
         """
-        active = active & (light.depth + at.depth <= dr.opaque(mi.UInt32, self._max_depth))
+        active = active & (light.depth + at.depth <= dr.opaque(mi.UInt32, self.max_depth))
         found = arriving(light, at.si.p, self.lights.kinds, active)
         out = at.si.to_local(found.direction)
         cosine = mi.Frame3f.cos_theta(out)
@@ -253,9 +255,9 @@ class Elements:
             own = active & ~at.diffuse & ~dr.all(found.irradiance == 0)
             bsdf = at.si.bsdf().eval(mi.BSDFContext(), at.si, out, own)
             value = dr.select(at.diffuse, value, bsdf * at.weight)
-            largest = dr.maximum(largest, dr.select(own, dr.pi * dr.max(bsdf), 0))
-        near, clamp = largest * found.cosine, dr.opaque(mi.Float, min(self.lights.clamp, 1e30))
-        scale = dr.select((light.depth > 2) & (near > clamp), clamp / near, 1)
+            largest = receiving(largest, dr.select(own, bsdf, 0))
+        clamp = dr.opaque(mi.Float, self.clamp)
+        scale = dr.select(light.depth > 2, kept(largest, found.cosine, clamp), 1)
         value *= found.irradiance * scale
         return value, found.direction, active & ~dr.all(value == 0)  # NaN is lit, so that it is noticed
 
@@ -282,7 +284,7 @@ class Elements:
 
         if not self.surfaces.passes_straight:
             return dr.select(active & ~self.scene.ray_test(towards(at.si), active), value, 0)
-        most = dr.opaque(mi.UInt32, self._max_depth) - light.depth - at.depth
+        most = dr.opaque(mi.UInt32, self.max_depth) - light.depth - at.depth
         share, _, _ = pass_straight(self.scene, towards(at.si), active, most, towards, lambda c: c)
         return dr.select(active, value * share, 0)
 

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from mi_sparse_prt.manylights.clamping import sending
+
 #: What a light is: light from one direction; a point that sends out light by the cosine; an emitter of Mitsuba that
 #: shines from a point; a point on a surface that reflects light as its BSDF says.
 DIRECTION, COSINE, EMITTER, SURFACE = range(4)
@@ -120,7 +122,7 @@ def arriving(light: LightArrays, p: mi.Point3f, kinds: LightKinds, active: mi.Ma
     towards = light.place - p
     square = dr.maximum(dr.squared_norm(towards), 1e-30)
     direction = dr.select(distant, mi.Vector3f(light.place), towards * dr.rsqrt(square))
-    cosine = dr.select(distant, 0, dr.maximum(-dr.dot(light.normal, direction), 0) / square)
+    cosine = dr.select(distant, 0, facing(light.normal, direction) / square)
     irradiance = light.power * dr.select(distant, 1, cosine)
     if kinds.emitters:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
@@ -132,10 +134,38 @@ def arriving(light: LightArrays, p: mi.Point3f, kinds: LightKinds, active: mi.Ma
     if kinds.surfaces is not None:
         own = active & (light.kind == SURFACE) & (cosine > 0)
         si = dr.gather(mi.SurfaceInteraction3f, kinds.surfaces, light.surface, own)
-        out = si.to_local(-direction)
-        value = si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, out, own)
-        turned = dr.abs(dr.dot(light.normal, direction)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(out)), 1e-4)
-        scale = dr.select(own, turned / square, 0)
+        value, scale = reflected(si, light.normal, direction, square, own)
         irradiance = dr.select(light.kind == SURFACE, light.power * value * scale, irradiance)
-        cosine = dr.maximum(cosine, dr.select(own, dr.pi * dr.max(value) * scale, 0))
+        cosine = sending(cosine, dr.select(own, value, 0), scale)
     return Arriving(direction, irradiance, cosine)
+
+
+def facing(normal: mi.Vector3f, direction: mi.Vector3f) -> mi.Float:
+    """Cosine at a light on a surface, of directions towards it; 0 behind."""
+    return dr.maximum(-dr.dot(normal, direction), 0)
+
+
+def reflected(
+    si: mi.SurfaceInteraction3f,
+    normal: mi.Vector3f,
+    direction: mi.Vector3f,
+    square: mi.Float,
+    active: mi.Mask,
+) -> tuple[mi.Color3f, mi.Float]:
+    """What glossy surfaces reflect of flux from ``si.wi``, and its scale: their product is irradiance per flux.
+
+    Parameters
+    ----------
+    si : SurfaceInteraction3f
+    normal : Vector3f
+        Geometric.
+    direction : Vector3f
+        From the point that is lit, world.
+    square : Float
+        Of the distance from there.
+    active : Mask
+    """
+    out = si.to_local(-direction)
+    value = si.bsdf().eval(mi.BSDFContext(mi.TransportMode.Importance), si, out, active)
+    turned = dr.abs(dr.dot(normal, direction)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(out)), 1e-4)
+    return value, dr.select(active, turned / square, 0)

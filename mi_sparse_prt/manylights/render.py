@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from mi_sparse_prt.core.profiling import peak_memory, reset_peak_memory, version
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.variant import check_variant
+from mi_sparse_prt.manylights.compensation import PATHS, SURVEY, LeftOut, joined, trace_left_out
 from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
     SECOND,
@@ -72,8 +74,13 @@ class ManyLightsImage:
         image. Under other colours and intensities of the emitters, it is another weighted sum (``mixed``).
     report : dict
         ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
-        ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known),
-        ``clamp``, ``peak_memory_bytes``, ``parameters``, ``seed``, ``versions``. JSON as it is.
+        ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known; with
+        ``compensate`` the noise of its paths is in it), ``left_out``, ``clamp``, ``peak_memory_bytes``,
+        ``parameters``, ``seed``, ``versions``. JSON as it is.
+
+        ``left_out`` has shares of the mean radiance of the image with all light, each with its ``standard_error``:
+        ``clamped``, what the clamp cuts off, and ``specular``, light by way of mirrors and glass between samples and
+        lights. They are missing in the image, or were ``added``.
     """
 
     image: Floats
@@ -135,6 +142,7 @@ class Settings:
     clamp: float | None = None
     seed: int = 0
     groups: bool = False
+    compensate: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -187,7 +195,8 @@ def render_many_lights(
         ``method``: ``"adaptive"``, or ``"hasan2007"`` for the paper as published. ``spp``: samples per pixel (4).
         ``lights``: about how many (100,000). ``max_depth``: as for ``path`` (5). ``clamp``: see ``LightOptions``.
         ``seed`` (0). ``groups``: no cluster has lights of two emitters, and the image comes in layers, one for each
-        (false).
+        (false). ``compensate``: add what the clamp cuts off, and light that comes to samples by way of mirrors and
+        glass, by paths from samples (false); the image is that of ``path`` then, with some grain.
 
     Returns
     -------
@@ -214,7 +223,8 @@ def render_many_lights(
     with run.clock.phase("load"):
         view = find_view(scene, sensor)
     found = RowColumn(matrix_of(view, asked, run), asked, run)
-    return found.picture(found.estimate(preview))
+    found.trace_left_out()  # first: what it takes is not left for rows and columns
+    return found.picture(found.compensated(found.estimate(preview)))
 
 
 def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> View:
@@ -268,6 +278,8 @@ class RowColumn:
         self.samples, self.lights = elements.samples, elements.lights
         self.rows, self.columns = settings.rows, settings.columns
         self.layers: dict[str, Floats] = {}
+        self._left_out: LeftOut | None = None
+        self._added, self._added_of = np.zeros((1, 3), np.float32), dict[str, Floats]()
 
     def costs(self) -> Costs:
         """What a row and a column take, from a few of them, and clustering for each column."""
@@ -341,6 +353,29 @@ class RowColumn:
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
             return sum_with_error(self.elements, partition, self.settings.spp, rng, bar.update)
 
+    def trace_left_out(self) -> None:
+        """Light that the matrix does not have: of all samples, if it is to be added, else of some, to tell how much."""
+        seed, m, whole = self.settings.seed, len(self.samples), self.settings.compensate
+        rows = np.arange(m) if whole or m <= SURVEY else self.samples.stratified_rows(SURVEY, seed)
+        names = self.lights.names if whole and self.settings.groups else ()
+        bar = self.run.bar(len(rows) * max(len(names), 1), "compensation", " samples")
+        with self.run.clock.phase("compensation"), bar:
+            trace = partial(trace_left_out, self.elements, rows, PATHS if whole else 1, seed, bar.update)
+            found = [trace(k) for k in range(len(names))] or [trace()]
+        self._left_out = joined(found)
+        if whole:
+            self._added = self._left_out.values
+            self._added_of = {name: own.values for name, own in zip(names, found, strict=False)}
+
+    def compensated(self, estimate: Estimate) -> Estimate:
+        """With the light that paths found, if it is to be added: layers have theirs, too."""
+        if self._left_out is None or not self.settings.compensate:
+            return estimate
+        for name, values in self._added_of.items():
+            self.layers[name] = self.layers.get(name, 0) + values
+        noise = float(self._left_out.variances[:, -1].sum()) / self.samples.spp**2
+        return Estimate(estimate.values + self._added, estimate.squared_error + noise)
+
     def estimate(self, preview: Callable[[Floats], object] | None = None) -> Estimate:
         """All steps; within a time budget, rows and columns by what a few of them cost."""
         if not len(self.samples) or not len(self.lights):
@@ -354,7 +389,7 @@ class RowColumn:
         reduced = self.reduced(self.rows)
         if preview is not None:
             rough = self.partition(reduced, -(-self.columns // EARLY))
-            preview(self.samples.image(self.summed(reduced, rough).values))
+            preview(self.samples.image(self.summed(reduced, rough).values + self._added))
         self.rows = min(self.rows, len(self.samples))
         if self.settings.groups:
             return self._by_group(reduced)
@@ -409,9 +444,23 @@ class RowColumn:
             "elements_total": m * n,
             "elements_evaluated": self.elements.evaluated,
             "estimated_error": (float(np.sqrt(squared_error / norm)) if norm > 0 else 0.0) if known else None,
+            "left_out": self._shares(image),
             "clamp": self.lights.clamp if np.isfinite(self.lights.clamp) else None,
             "peak_memory_bytes": peak_memory(),
             "parameters": {**vars(self.settings), "image": list(self.samples.shape)},
             "seed": self.settings.seed,
             "versions": versions(),
         }
+
+    def _shares(self, image: Floats) -> dict[str, Any] | None:
+        """Of the mean radiance of the image with all light, what the matrix does not have."""
+        if self._left_out is None:
+            return None
+        found, added = self._left_out.of_image(self.samples), self.settings.compensate
+        lost = 0.0 if added else sum(mean for mean, _ in found.values())
+        whole = max(float(image.mean(dtype=np.float64)) + lost, 1e-300)
+        shares = {
+            kind: {"share": mean / whole, "standard_error": error / whole}
+            for kind, (mean, error) in found.items()
+        }
+        return {**shares, "added": added}

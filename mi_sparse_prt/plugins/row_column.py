@@ -45,6 +45,7 @@ class RowColumn(mi.SamplingIntegrator):
     max_depth           integer    As for ``path``. (5)
     clamp               float      Largest geometry term of indirect lights, see ``LightOptions``. (0: by the size of
                                    the scene)
+    compensate          boolean    Add what the clamp cuts off, and light by way of mirrors and glass. (false)
     spp                 integer    Samples per pixel. (that of ``mi.render``, else of the sampler)
     progress            boolean    Show a forecast and progress bars. (false)
     =================== ========== =============================================================================
@@ -60,6 +61,7 @@ class RowColumn(mi.SamplingIntegrator):
             "lights": props.get("lights", 100_000),
             "max_depth": props.get("max_depth", 5),
             "clamp": props.get("clamp", 0.0) or None,
+            "compensate": props.get("compensate", False),
         }
         self._spp = props.get("spp", 0)
         self._progress = props.get("progress", False)

@@ -39,6 +39,22 @@ def test_many_lights_writes_an_image_and_a_report(scene, tmp_path):
     assert np.array(mi.Bitmap(str(png))).shape == (8, 12, 3)
 
 
+def test_what_is_left_out_is_said_and_added(scene, tmp_path):
+    exr, report = tmp_path / "a.exr", tmp_path / "a.json"
+    found = [
+        prt.render_many_lights(scene, 8, 16, lights=200, max_depth=3, compensate=c) for c in (False, True)
+    ]
+    for arguments, expected, words in (
+        ((), found[0], "left out"),
+        (("--compensate",), found[1], "added, left out"),
+    ):
+        result = call("many-lights", scene, "-o", exr, *SMALL, *arguments, "--json", report)
+        assert result.exit_code == 0
+        assert f"{words} by the clamp" in result.stdout and f"{words} by mirrors, glass" in result.stdout
+        assert json.loads(report.read_text())["left_out"] == expected.report["left_out"]
+        assert np.array_equal(np.array(mi.Bitmap(str(exr))), expected.image)
+
+
 def test_groups_are_layers_of_one_file(scene, tmp_path):
     exr = tmp_path / "a.exr"
     assert call("many-lights", scene, "-o", exr, *SMALL, "--groups", "-q").exit_code == 0

@@ -23,10 +23,23 @@ def many_lights_table(scene: str, report: dict[str, Any]) -> Table:
         ("elements", f"{report['elements_evaluated']:,} of {report['elements_total']:,}"),
         ("estimated error", "not known" if error is None else percent(error)),
     ]
+    facts += _left_out(report["left_out"])
     steps = [(phase, duration(taken)) for phase, taken in report["seconds"].items()]
     memory = [("peak memory", byte_count(report["peak_memory_bytes"]))]
     title = f"{scene}: {report['parameters']['method']}, {lights['total']:,} lights"
     return new_table(title, FACTS, facts, emitters, steps, memory)
+
+
+def _left_out(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Light that the matrix does not have, as shares of the mean radiance."""
+    kinds = {"clamped": "by the clamp", "specular": "by mirrors, glass"}
+    return [
+        (
+            f"{'added, left out' if report['added'] else 'left out'} {how}",
+            f"{percent(report[kind]['share'])} +- {percent(report[kind]['standard_error'])}",
+        )
+        for kind, how in kinds.items()
+    ]
 
 
 def many_lights_tables(report: dict[str, Any]) -> list[Table]:
