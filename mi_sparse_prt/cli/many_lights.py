@@ -44,6 +44,14 @@ Seconds = Annotated[
         metavar="SECONDS", help="Choose --rows and --columns so that it takes so long.", show_default=False
     ),
 ]
+ErrorOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SHARE",
+        help="Raise --rows and --columns until the estimated error is so small, 0.02 is 2%, or --seconds are over.",
+        show_default=False,
+    ),
+]
 MethodOption = Annotated[
     ManyLightsMethod, typer.Option(help="hasan2007 is the paper on matrix row-column sampling as published.")
 ]
@@ -89,6 +97,7 @@ def many_lights(
     rows: Rows = 300,
     columns: Columns = 900,
     seconds: Seconds = None,
+    error: ErrorOption = None,
     method: MethodOption = ManyLightsMethod.adaptive,
     lights: Lights = 100_000,
     spp: Samples = 4,
@@ -109,7 +118,8 @@ def many_lights(
 
     Example: mi-sparse-prt many-lights scenes_xml/cornell.xml -o cornell.exr --rows 300 --columns 900
 
-    A forecast comes first, its own estimate of its error last. By time: --seconds 10 in place of --rows and --columns.
+    A forecast comes first, its own estimate of its error last. In place of --rows and --columns:
+    --seconds 10 for all that fits into them, --error 0.02 for as much as it takes.
     """
     if output.suffix.lower() not in (".exr", ".png"):
         raise typer.BadParameter(f"{output}: give a name that ends in .exr or .png", param_hint="-o")
@@ -143,6 +153,7 @@ def many_lights(
                 seed=seed,
                 groups=groups,
                 compensate=compensate,
+                error=error,
             )
         if groups:
             command.write(output, layers_bytes(found.image, found.layers))

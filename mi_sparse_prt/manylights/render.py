@@ -41,6 +41,8 @@ METHODS = "hasan2007", "adaptive"
 PROJECTED = 50  # dimensions of reduced columns ([HPB07] 4: r')
 COLUMNS_PER_ROW = 3  # within a time budget
 FEWEST = 16, 48  # rows and columns
+FIRST = 50  # rows, where an error is asked for
+GROWTH = 1.5, 4.0  # of rows and columns from one try to the next: the error falls about as they grow
 _PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
 
 PILOT = 16  # rows, and columns, that tell what others cost
@@ -75,7 +77,8 @@ class ManyLightsImage:
     report : dict
         ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
         ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known; with
-        ``compensate`` the noise of its paths is in it), ``left_out``, ``clamp``, ``peak_memory_bytes``,
+        ``compensate`` the noise of its paths is in it), ``tries`` (with ``error``: rows, columns and estimated error of
+        each), ``left_out``, ``clamp``, ``peak_memory_bytes``,
         ``parameters``, ``seed``, ``versions``. JSON as it is.
 
         ``left_out`` has shares of the mean radiance of the image with all light, each with its ``standard_error``:
@@ -143,6 +146,7 @@ class Settings:
     seed: int = 0
     groups: bool = False
     compensate: bool = False
+    error: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -152,6 +156,12 @@ class Settings:
                 raise PrtError(f"{name} is {getattr(self, name)}: give 1 or more")
         if self.seconds is not None and not self.seconds > 0:
             raise PrtError(f"seconds is {self.seconds}: give a number above 0")
+        if self.error is not None and not self.error > 0:
+            raise PrtError(f"error is {self.error}: give a number above 0, 0.02 for 2%")
+        if self.error is not None and self.method != "adaptive":
+            raise PrtError(
+                f"method {self.method!r} does not know its error: take adaptive, or leave error out"
+            )
         self.light_options()
 
     def light_options(self) -> LightOptions:
@@ -196,7 +206,9 @@ def render_many_lights(
         ``lights``: about how many (100,000). ``max_depth``: as for ``path`` (5). ``clamp``: see ``LightOptions``.
         ``seed`` (0). ``groups``: no cluster has lights of two emitters, and the image comes in layers, one for each
         (false). ``compensate``: add what the clamp cuts off, and light that comes to samples by way of mirrors and
-        glass, by paths from samples (false); the image is that of ``path`` then, with some grain.
+        glass, by paths from samples (false); the image is that of ``path`` then, with some grain. ``error``: in place
+        of ``rows`` and ``columns``, try more and more until the estimated error is at most this one, or the next try
+        would take longer than ``seconds``.
 
     Returns
     -------
@@ -278,6 +290,7 @@ class RowColumn:
         self.samples, self.lights = elements.samples, elements.lights
         self.rows, self.columns = settings.rows, settings.columns
         self.layers: dict[str, Floats] = {}
+        self.tries: list[dict[str, float]] = []
         self._left_out: LeftOut | None = None
         self._added, self._added_of = np.zeros((1, 3), np.float32), dict[str, Floats]()
 
@@ -381,15 +394,40 @@ class RowColumn:
         if not len(self.samples) or not len(self.lights):
             self.rows = self.columns = 0
             return Estimate(np.zeros((len(self.samples), 3), np.float32), 0.0)
+        if self.settings.error is not None:
+            return self._until_good(self.settings.error, preview)
         if self.settings.seconds is not None or self.run.progress:
             costs = self.costs()
             if self.settings.seconds is not None:
                 self.rows, self.columns = self._affordable(costs, self.settings.seconds)
-            self._announce(self.forecast(costs))
+            self._announce(f", about {self.forecast(costs):.2g} s")
         reduced = self.reduced(self.rows)
         if preview is not None:
             rough = self.partition(reduced, -(-self.columns // EARLY))
             preview(self.samples.image(self.summed(reduced, rough).values + self._added))
+        return self._sum_of(reduced)
+
+    def _until_good(self, error: float, preview: Callable[[Floats], object] | None) -> Estimate:
+        """Ever more rows and columns, from new ones: all tries but the last take about as long as that one."""
+        m, n = self.elements.shape
+        rows, spent = float(FIRST), self.run.clock.report()["total"]
+        while True:
+            self.rows, self.columns = min(round(rows), m), min(round(COLUMNS_PER_ROW * rows), n)
+            every = self.rows == m and self.columns == n
+            self._announce()
+            found = self._sum_of(self.reduced(self.rows))
+            image = self.samples.image(found.values + self._added)
+            known = _relative(image, found.squared_error)
+            self.tries.append({"rows": self.rows, "columns": self.columns, "estimated_error": known})
+            if preview is not None:
+                preview(image)
+            growth = float(np.clip(np.nan_to_num(known / error, nan=np.inf), *GROWTH))
+            now = self.run.clock.report()["total"]
+            if known <= error or every or now + growth * (now - spent) > (self.settings.seconds or np.inf):
+                return found
+            rows, spent = growth * rows, now
+
+    def _sum_of(self, reduced: ReducedColumns) -> Estimate:
         self.rows = min(self.rows, len(self.samples))
         if self.settings.groups:
             return self._by_group(reduced)
@@ -411,11 +449,11 @@ class RowColumn:
         values = np.asarray(sum(one.values for one in found), np.float32)
         return Estimate(values, sum(one.squared_error for one in found))
 
-    def _announce(self, seconds: float) -> None:
+    def _announce(self, more: str = "") -> None:
         if self.run.progress:
             m, n = self.elements.shape
             print(
-                f"{m:,} samples, {n:,} lights: {self.rows} rows and {self.columns} columns, about {seconds:.2g} s",
+                f"{m:,} samples, {n:,} lights: {self.rows} rows and {self.columns} columns{more}",
                 file=sys.stderr,
             )
 
@@ -433,8 +471,7 @@ class RowColumn:
 
     def _report(self, image: Floats, squared_error: float) -> dict[str, Any]:
         m, n = self.elements.shape
-        norm = float(np.square(image, dtype=np.float64).sum())
-        known = np.isfinite(squared_error)
+        error = _relative(image, squared_error)
         return {
             "seconds": self.run.clock.report(),
             "rows": self.rows,
@@ -443,7 +480,8 @@ class RowColumn:
             "lights": {"total": n, "emitters": self.lights.counts()},
             "elements_total": m * n,
             "elements_evaluated": self.elements.evaluated,
-            "estimated_error": (float(np.sqrt(squared_error / norm)) if norm > 0 else 0.0) if known else None,
+            "estimated_error": error if np.isfinite(error) else None,
+            "tries": self.tries,
             "left_out": self._shares(image),
             "clamp": self.lights.clamp if np.isfinite(self.lights.clamp) else None,
             "peak_memory_bytes": peak_memory(),
@@ -464,3 +502,9 @@ class RowColumn:
             for kind, (mean, error) in found.items()
         }
         return {**shares, "added": added}
+
+
+def _relative(image: Floats, squared_error: float) -> float:
+    """Relative 2-norm of an error; 0 of a black image, NaN where the error is not known."""
+    norm = float(np.square(image, dtype=np.float64).sum())
+    return float(np.sqrt(squared_error / norm)) if norm > 0 else 0.0

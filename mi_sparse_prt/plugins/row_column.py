@@ -40,6 +40,7 @@ class RowColumn(mi.SamplingIntegrator):
     rows                integer    Rows that are evaluated: samples and all lights. (300)
     columns             integer    Columns that are evaluated: lights and all samples. (900)
     seconds             float      Choose both by what they cost. (0: do not)
+    error               float      Raise both until the estimated error is so small, 0.02 is 2%. (0: do not)
     method              string     ``adaptive``, or ``hasan2007``: the paper as published. (adaptive)
     lights              integer    Lights in all, about. (100,000)
     max_depth           integer    As for ``path``. (5)
@@ -57,6 +58,7 @@ class RowColumn(mi.SamplingIntegrator):
             "rows": props.get("rows", 300),
             "columns": props.get("columns", 900),
             "seconds": props.get("seconds", 0.0) or None,
+            "error": props.get("error", 0.0) or None,
             "method": props.get("method", "adaptive"),
             "lights": props.get("lights", 100_000),
             "max_depth": props.get("max_depth", 5),

@@ -548,3 +548,41 @@ def test_what_is_seen_of_each_emitter_adds_up(matrix: Elements) -> None:
     ]
     assert sum(samples.seen_of.values()) == pytest.approx(samples.seen, abs=1e-5)
     assert not matrix.samples.seen_of
+
+
+# -- rows and columns by the error ------------------------------------------------------------------------------------
+
+
+def test_rows_and_columns_grow_until_the_error_is_small(small_room: mi.Scene) -> None:
+    """Expected: no try but the last tells an error that is small enough; the last one's is reported, and about true."""
+    settings = {"lights": 2000, "max_depth": 3, "seed": 3}
+    found = prt.render_many_lights(small_room, error=0.02, **settings)
+    tries = found.report["tries"]
+    assert [t["estimated_error"] <= 0.02 for t in tries] == [False] * (len(tries) - 1) + [True]
+    assert all(
+        a["rows"] < b["rows"] and a["columns"] < b["columns"] for a, b in zip(tries, tries[1:], strict=False)
+    )
+    assert found.report["estimated_error"] == pytest.approx(tries[-1]["estimated_error"])
+    assert (found.report["rows"], found.report["columns"]) == (tries[-1]["rows"], tries[-1]["columns"])
+    exact = prt.render_many_lights(small_room, rows=20, columns=2000, **settings).image
+    assert np.linalg.norm(found.image - exact) < 0.06 * np.linalg.norm(exact)
+
+
+def test_an_error_that_is_out_of_reach(small_room: mi.Scene) -> None:
+    """Expected: all lights, and no error; or what fits into a time, of which the first try takes the rest."""
+    every = prt.render_many_lights(small_room, error=1e-9, lights=300, max_depth=3)
+    assert every.report["estimated_error"] < 1e-9 and len(every.report["tries"]) > 1
+    short = prt.render_many_lights(small_room, error=1e-9, seconds=1e-6, lights=2000, max_depth=3)
+    assert len(short.report["tries"]) == 1 and short.report["estimated_error"] > 1e-9
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"error": 0}, "error is 0: give a number above 0"),
+        ({"method": "hasan2007"}, "does not know its error"),
+    ],
+)
+def test_errors_that_make_no_sense(small_room: mi.Scene, options: dict, message: str) -> None:
+    with pytest.raises(prt.PrtError, match=message):
+        prt.render_many_lights(small_room, **{"error": 0.1, **options})
