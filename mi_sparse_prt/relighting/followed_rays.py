@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.scene.scene import Scene
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
+NEAR_LAMP = 1e-3  # of the way to a lamp: what is met there is the lamp itself
 
 
 class Way(NamedTuple):
@@ -156,3 +158,27 @@ def reflected_background(
     value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(there.d), active)
     share = dr.select(there.delta, 1, there.pdf / (there.pdf + density))
     return dr.select(active, value * light * share, 0)
+
+
+def reflected_lamps(
+    lamps: SampledEmission,
+    brightness: mi.Color3f,
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
+) -> mi.Color3f:
+    """Light that surfaces reflect of lamps which no ray can meet, points and directions, by a shadow ray.
+
+    It goes to one lamp at random. The others are found by following rays.
+    """
+    chosen = mi.UInt32(sampler.next_1d(active) * lamps.size)
+    element = dr.minimum(chosen, dr.opaque(mi.UInt32, lamps.size - 1))
+    towards, irradiance, distance = lamps.sample(element, si.p, mi.Point2f(sampler.next_2d(active)))
+    ray = si.spawn_ray(towards)
+    met = scene.ray_intersect(ray, active)
+    found, _ = lamps.element_of(met, ray, active)
+    active &= (found != mi.Int32(element)) & ~(met.t < distance * (1 - NEAR_LAMP))
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), active)
+    light = irradiance * dr.gather(mi.Color3f, brightness, element, active) * lamps.size
+    return dr.select(active, value * light, 0)

@@ -33,6 +33,7 @@ from mi_sparse_prt.relighting.followed_rays import (
     follow,
     past_lamps,
     reflected_background,
+    reflected_lamps,
     surfaces_to_follow,
 )
 from mi_sparse_prt.scene.materials import is_one_of
@@ -122,6 +123,9 @@ class RelitScene:
             if self.followed:
                 reflects = active & ~way.last & whole
                 value += reflected_background(self._background, self._scene, si, sampler, reflects)
+        if self._lamps is not None and self.followed:
+            reflects = active & ~way.last & whole & si.is_valid()
+            value += reflected_lamps(self._lamps[0], self._brightness, self._scene, si, sampler, reflects)
         return Seen(value, si, whole)
 
     def _met(
@@ -420,7 +424,7 @@ def relit_scene(scene: Scene, transport: LightTransport, environment: Any) -> Re
         irradiance = np.zeros((1, scene.n_vertices, 3), np.float32)
     else:
         irradiance = transport.irradiance_by_depth(environment)
-    followed = () if dark or lamps is not None else surfaces_to_follow(scene, transport.reflection)
+    followed = () if dark else surfaces_to_follow(scene, transport.reflection)
     return RelitScene(scene, irradiance, background, lamps, transport.max_depth, followed)
 
 

@@ -354,3 +354,43 @@ def test_points_of_a_measurement_are_in_the_world(scene, transport):
     world = hits.positions / scene.scale + scene.centre
     assert np.abs(world - points.positions).max() < 5e-3 / scene.scale
     assert (np.einsum("nd,nd->n", points.ray_offsets, points.normals) > 0).all()
+
+
+@pytest.mark.parametrize("lamp", ["panel", "point"])
+def test_glossy_surfaces_show_lamps(lamp):
+    """Rationale: no row tells what a golden ball reflects to the camera: its rays go on, to lamps that they can meet by
+    chance, and to points that they cannot.
+
+    Expected: the mean of the ball, and of the picture, is that of `path` within three standard errors and 1.25%.
+    """
+    lamps = {
+        "panel": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),
+            "emitter": {"type": "area", "radiance": 5.0},
+        },
+        "point": {"type": "point", "position": [-0.3, 2.2, 1.2], "intensity": 6.0},
+    }
+    gold = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
+    scene = build(
+        0.2,
+        **still_life(),
+        gold={"type": "sphere", "center": [0.2, 0.5, 1.0], "radius": 0.35, "bsdf": gold},
+        lamp=lamps[lamp],
+        sky={"type": "constant", "radiance": 0.2},
+        camera={
+            "type": "perspective",
+            "fov": 20,
+            "to_world": T().look_at([1.2, 1.9, 3.2], [0.2, 0.5, 1.0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}},
+        },
+    )
+    transport = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=4, progress=False)
+    ours, light = prt.render(scene, transport, [1.0, 3.0], 0, 256), [1.0, 3.0]
+    with transport.emission.scene_lit_by(light, scene) as lit:
+        found = np.array([path_image(lit, scene.sensor(0), 4, 256, seed) for seed in range(4)])
+    for part in (slice(None), slice(10, 22)):
+        means = found[:, part, part].mean(axis=(1, 2, 3), dtype=np.float64)
+        noise, known = np.std(means, ddof=1) / 2, means.mean()
+        assert ours[part, part].mean() == pytest.approx(known, abs=3 * noise + 0.0125 * known)
+        assert noise < 0.0025 * known
