@@ -5,8 +5,10 @@ Pure helpers are imported (``from conftest import diffuse``), what is expensive 
 
 import gc
 import importlib
+import math
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.estimation.element_sampling import Effort
-from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.clustered import Clustered
@@ -266,6 +268,26 @@ def usual_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 PIPELINE.held_out_error = partial(held_out_error, effort=Effort(spp=64, specular_strata=4))
+
+
+def _unknown_error(*_: object, **__: object) -> HeldOutError:
+    return HeldOutError(math.nan, {}, {"total": math.nan, "meshes": {}}, 0, {}, [])
+
+
+@contextmanager
+def without_held_out() -> Iterator[None]:
+    """Precomputations do not find their error, which is NaN: where nobody looks at it, nor aims at one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PIPELINE, "held_out_error", _unknown_error)
+        patch.setattr(PIPELINE, "held_out_lamp_error", _unknown_error)
+        yield
+
+
+@pytest.fixture
+def no_held_out() -> Iterator[None]:
+    """``without_held_out``, for one test."""
+    with without_held_out():
+        yield
 
 
 @pytest.fixture

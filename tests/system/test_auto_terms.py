@@ -73,6 +73,7 @@ def test_diffuse_scenes_do_not_change(grey_scene):
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+@pytest.mark.usefixtures("no_held_out")
 def test_rough_conductor():
     """
     Rationale: a rough metal ball as large as a third of the image is as right by its factors as by rays that go on
@@ -93,6 +94,7 @@ def test_rough_conductor():
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+@pytest.mark.usefixtures("no_held_out")
 def test_what_narrow_lobes_send_to_a_wall(usual_factors):
     """
     Rationale: pictures show a polished metal by rays that go on; what it throws on a wall is blurred there, and 16
@@ -125,6 +127,7 @@ def test_what_narrow_lobes_send_to_a_wall(usual_factors):
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+@pytest.mark.usefixtures("no_held_out")
 def test_beside_mirror_and_mask():
     """
     Rationale: a camera's ray goes on at a mirror and at a half-open sheet, and meets rough metal behind them; metal

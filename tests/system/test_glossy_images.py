@@ -6,7 +6,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
+from conftest import T, build, diffuse, without_held_out
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.precompute import precompute_glossy
@@ -62,7 +62,8 @@ def scene() -> prt.Scene:
 
 @pytest.fixture(scope="module")
 def transport(scene) -> LightTransport:
-    return precompute_glossy(scene, LIGHTING, progress=False)
+    with without_held_out():
+        return precompute_glossy(scene, LIGHTING, progress=False)
 
 
 def validated(scene: prt.Scene, transport: LightTransport, **parameters: object) -> GlossyValidation:
@@ -155,6 +156,7 @@ def test_turned_tangents_are_blamed_on_transport(scene, transport, good):
     assert found["transport"] > 0.16  # twice the bound above
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_wrong_factors_are_blamed_on_factorization(scene, good):
     """One factor instead of four (and direct light only): the references with factors follow, transport is right."""
     found = errors(

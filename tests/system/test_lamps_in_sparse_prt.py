@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 import mi_sparse_prt as prt
 from mi_sparse_prt import cache
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 SIZE = 32
 RUNS = 4  # independent renders, whose spread is the standard error
 WALLS = """

@@ -10,6 +10,7 @@ from conftest import T, diffuse
 import mi_sparse_prt as prt
 from mi_sparse_prt.scene.scene import Scene
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 SIZE, SPP = 24, 64
 SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 1.2, 1.5]}}
 PANEL = {

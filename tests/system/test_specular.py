@@ -54,6 +54,7 @@ def objects(albedo: float) -> dict:
     }
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_furnace():
     """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
 
@@ -114,13 +115,14 @@ def test_gathered_light_is_that_of_paths():
 
 
 @pytest.mark.parametrize(
-    ("glass", "spp"), [({"type": "dielectric"}, 6144), ({"type": "roughdielectric", "alpha": 0.2}, 49152)]
+    ("glass", "spp"), [({"type": "dielectric"}, 6144), ({"type": "roughdielectric", "alpha": 0.2}, 57344)]
 )
 def test_specular_light_is_what_paths_find_beside_the_rest(glass, spp):
     """Expected: the part by way of mirrors and glass alone is what all paths find less those scattered on the way.
 
     Total light of the six texels over the floor, two independent estimates each: within 3 standard errors, of which one
-    is at most 0.65%, so that a specular part that is 2% off fails.
+    is at most 0.65%, so that a specular part that is 2% off fails. All of that error is of paths; what these find by
+    mirrors alone has the most noise, so that the rest needs few of them.
     """
     shapes: dict = {
         "floor": {**FLOOR, "to_world": T().rotate([1, 0, 0], -90), "bsdf": diffuse(0.6, 0.6, 0.6)},
@@ -132,15 +134,15 @@ def test_specular_light_is_what_paths_find_beside_the_rest(glass, spp):
     floor = np.arange(scene.meshes[0].vertices.stop)
     power = lighting.solid_angles[None, :, None]
 
-    def of_paths(apart: bool, seed: int) -> tuple[float, float]:
+    def of_paths(apart: bool, spp: int, seed: int) -> tuple[float, float]:
         found = PathSolver(replace(problem, specular_apart=apart), spp, seed).rows(floor)
         variance = (found.variance * power**2).sum(axis=(0, 1)).mean()
         return float((found.mean * power).sum(axis=(0, 1)).mean()), float(variance)
 
-    (every, v), (scattered, w) = of_paths(False, 1), of_paths(True, 2)
+    (every, v), (scattered, w) = of_paths(False, spp, 1), of_paths(True, spp // 4, 2)
     halves = [
         float(
-            specular_light(problem, seed, SpecularOptions(8, 8), floor)
+            specular_light(problem, seed, SpecularOptions(4, 4), floor)
             .operator.rows(floor)
             .sum(axis=(0, 1))
             .mean()
@@ -223,7 +225,7 @@ def test_noise_is_told():
     scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
     problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
     ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
-    exact = specular_light(problem, 9, SpecularOptions(6, 6, strata=6)).operator.rows(ids) * power
+    exact = specular_light(problem, 9, SpecularOptions(5, 5, strata=4)).operator.rows(ids) * power
     noises = []
     for strata in (1, 2):
         found = specular_light(problem, 4, SpecularOptions(strata, strata, strata=4))
@@ -234,6 +236,7 @@ def test_noise_is_told():
     assert noises[1] < 0.5 * noises[0]
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_each_surface_on_the_way_counts():
     """A floor in a box of air is black at max_depth 2, and lit at 3: light crosses one wall of the box."""
     shapes = {
@@ -252,6 +255,7 @@ def test_each_surface_on_the_way_counts():
     assert lit[1] == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_light_is_told_apart_by_the_surfaces_it_met():
     """Expected: light that met at most 1, 2, 3 surfaces is what paths of ``max_depth`` 3, 4, 5 find, mesh by mesh.
 
@@ -288,6 +292,7 @@ def test_light_is_told_apart_by_the_surfaces_it_met():
                 )
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_images_stop_light_where_paths_end():
     """Expected: a floor seen by way of glass, air and a half-open ball has the light that ``path`` leaves to it.
 
@@ -326,6 +331,7 @@ def test_images_stop_light_where_paths_end():
         assert means[0] == pytest.approx(means[1], rel=0.02)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_pixels_see_by_way_of_mirrors_and_glass():
     """Expected: at the points that a camera sees, light that is gathered is that of paths, and none is counted twice.
 
@@ -352,6 +358,7 @@ def test_pixels_see_by_way_of_mirrors_and_glass():
     assert means[0] == pytest.approx(means[1], rel=0.01)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_light_falls_through_holes():
     """Expected: a cut-out card over a floor is in the way where its texture says so, and a pane takes its share."""
     card = {"type": "rectangle", "to_world": T().translate([0, 0.5, 0]).rotate([1, 0, 0], -90)}
