@@ -38,6 +38,7 @@ from mi_sparse_prt.validation.reference_matrix import ReferenceMatrix
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+DPI = 110  # of figures in files
 PIXELS = 1 << 14  # rows, at most, of a matrix of pixels
 PIXEL_SPP = 32  # at least
 COLUMNS = 32  # of a matrix of pixels at a time: it has many points
@@ -77,7 +78,7 @@ def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
-        figure.savefig(path, dpi=110, bbox_inches="tight")
+        figure.savefig(path, dpi=DPI, bbox_inches="tight")
     return paths
 
 
