@@ -305,12 +305,12 @@ class Elements:
         """The same, each light's values after those of the one before: (count * m)."""
         m = len(self.samples)
         at, start = self.samples.receivers(chosen.samples), chosen.starts + first
-        found = dr.zeros(mi.Color3f, m * count)
+        found, rows = dr.zeros(mi.Color3f, m * count), dr.opaque(mi.UInt32, m)
         k, last = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, count)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
             factor = dr.gather(mi.Color3f, chosen.weights, start + k)
-            dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * m + chosen.samples)
+            dr.scatter(found, factor * self.element(at, light, mi.Mask(True)), k * rows + chosen.samples)
             k += 1
         dr.eval(found)
         return found
@@ -322,13 +322,13 @@ class Elements:
         """Means of pairs of columns added up, and their differences (count * m)."""
         m = len(self.samples)
         at, start = self.samples.receivers(chosen.samples), chosen.starts + dr.opaque(mi.UInt32, 2 * first)
-        total, apart = mi.Color3f(total), dr.zeros(mi.Color3f, m * count)
+        total, apart, rows = mi.Color3f(total), dr.zeros(mi.Color3f, m * count), dr.opaque(mi.UInt32, m)
         k, last, before = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 2 * count), mi.Color3f(0)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
             value = dr.gather(mi.Color3f, chosen.weights, start + k) * self.element(at, light, mi.Mask(True))
             total += 0.5 * value
-            dr.scatter(apart, before - value, (k >> 1) * m + chosen.samples, (k & 1) == 1)
+            dr.scatter(apart, before - value, (k >> 1) * rows + chosen.samples, (k & 1) == 1)
             before = mi.Color3f(value)
             k += 1
         dr.eval(total, apart)
@@ -342,13 +342,13 @@ class Elements:
         n = len(self.lights)
         lane = dr.arange(mi.UInt32, n)
         light = self.lights.arrays.take(lane)
-        norms = dr.zeros(mi.Float, n * count)
+        norms, columns = dr.zeros(mi.Float, n * count), dr.opaque(mi.UInt32, n)
         x, y, z = (mi.Float(square) for square in squares)
         k, row = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, first)
         last = dr.opaque(mi.UInt32, count)
         while k < last:
             value = self.element(receivers.take(row + k), light, mi.Mask(True))
-            dr.scatter(norms, dr.norm(value), k * n + lane)
+            dr.scatter(norms, dr.norm(value), k * columns + lane)
             x += dr.square(value.x)
             y += dr.square(value.y)
             z += dr.square(value.z)
@@ -399,4 +399,6 @@ def _on_device(ids: Ids, weights: Floats, samples: Ids, starts: Ids | None = Non
     colours = np.ascontiguousarray(np.asarray(weights, np.float32).reshape(-1, 3).T)
     first = np.zeros(len(samples)) if starts is None else starts
     columns, lanes, places = (mi.UInt32(np.ravel(x).astype(np.uint32)) for x in (ids, samples, first))
-    return _Chosen(columns, mi.Color3f(colours), lanes, places)
+    factors = mi.Color3f(colours)
+    dr.eval(columns, factors, lanes, places)  # or kernels know how many there are, and serve nothing else
+    return _Chosen(columns, factors, lanes, places)

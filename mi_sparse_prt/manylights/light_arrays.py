@@ -89,7 +89,7 @@ def joined(parts: Sequence[LightArrays]) -> LightArrays:
     first = 0
     for part in parts:
         size = dr.width(part.kind)
-        dr.scatter(result, part, dr.arange(mi.UInt32, size) + first)
+        dr.scatter(result, part, dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, first))
         first += size
     dr.eval(result)
     return result

@@ -334,7 +334,7 @@ def _area(source: _Source, number: int, count: int, seed: int) -> _Part:
     lights = no_lights(size)
     lights.kind = dr.full(mi.UInt32, COSINE, size)
     lights.place, lights.normal = found.p, mi.Vector3f(found.n)
-    lights.power = dr.select(found.pdf > 0, radiance / (found.pdf * size), 0)
+    lights.power = dr.select(found.pdf > 0, radiance / (found.pdf * dr.opaque(mi.Float, size)), 0)
     return _part(lights, number)
 
 
@@ -369,7 +369,7 @@ def _one(parts: list[_Part]) -> _Part:
     """Several parts in one; of lights on glossy surfaces, numbers go on from part to part."""
     first = 0
     for part in parts:
-        part.arrays.surface += dr.select(part.arrays.kind == SURFACE, first, 0)
+        part.arrays.surface += dr.select(part.arrays.kind == SURFACE, dr.opaque(mi.UInt32, first), 0)
         first += 0 if part.glossy is None else dr.width(part.glossy.t)
     glossy = None
     if first:
@@ -377,7 +377,7 @@ def _one(parts: list[_Part]) -> _Part:
         for part in parts:
             if part.glossy is not None:
                 size = dr.width(part.glossy.t)
-                dr.scatter(glossy, part.glossy, dr.arange(mi.UInt32, size) + first)
+                dr.scatter(glossy, part.glossy, dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, first))
                 first += size
         dr.eval(glossy)
     group = np.concatenate([np.zeros(0, np.int32), *(part.group for part in parts)])
@@ -414,12 +414,13 @@ def _square(count: int) -> int:
 
 def _stratified(count: int, rng: mi.PCG32) -> mi.Point2f:
     """A point in each of ``_square(count)`` cells of the unit square."""
-    across = round(np.sqrt(_square(count)))
-    cell = dr.arange(mi.UInt32, across**2)
+    cells = round(np.sqrt(_square(count)))
+    cell, across = dr.arange(mi.UInt32, cells**2), dr.opaque(mi.UInt32, cells)
     row = cell // across
     offset = next_2d(rng)
     return mi.Point2f(
-        (mi.Float(cell - row * across) + offset.x) / across, (mi.Float(row) + offset.y) / across
+        (mi.Float(cell - row * across) + offset.x) / mi.Float(across),
+        (mi.Float(row) + offset.y) / mi.Float(across),
     )
 
 

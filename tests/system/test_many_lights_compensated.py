@@ -251,7 +251,7 @@ def test_layers_have_what_is_left_out_of_each_lamp() -> None:
     """
     asked = {**SMALL, "rows": 40, "columns": 10**6, "lights": 3000, "compensate": True}
     found = prt.render_many_lights(corner(point=POINT), groups=True, **asked)
-    assert set(found.layers) == {"lamp", "point", "visible"}
+    assert set(found.layers) == {"lamp", "point"}
     assert sum(found.layers.values()) == pytest.approx(found.image, abs=1e-5)
     dark = {**LAMP, "emitter": {"type": "area", "radiance": 0.0}}
     alone = prt.render_many_lights(corner(point=POINT, lamp=dark), **asked)
