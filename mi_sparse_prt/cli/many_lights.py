@@ -130,11 +130,12 @@ def many_lights(
         from mi_sparse_prt.cli.tables.many_lights import many_lights_table
         from mi_sparse_prt.io.exr_layers import layers_bytes
         from mi_sparse_prt.scene.loading import load_mitsuba
+        from mi_sparse_prt.scene.unfolding import unfold_instances
 
         def write(image: NDArray[np.float32]) -> None:
             command.write(output, image_bytes(image, output.suffix.lower(), exposure))
 
-        loaded = load_mitsuba(scene, **options.definitions(define))
+        loaded = unfold_instances(load_mitsuba(scene, **options.definitions(define)))
         # an early picture is written while the work goes on, and must not be cut off
         with command.patient_interrupts() if preview else command.prompt_interrupts():
             found = prt.render_many_lights(

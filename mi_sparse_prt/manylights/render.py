@@ -36,6 +36,7 @@ from mi_sparse_prt.manylights.surfaces import Surfaces
 from mi_sparse_prt.sampling.row_column import random_projection
 from mi_sparse_prt.scene.loading import load_mitsuba
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.unfolding import unfold_instances
 
 METHODS = "hasan2007", "adaptive"
 PROJECTED = 50  # dimensions of reduced columns ([HPB07] 4: r')
@@ -191,7 +192,8 @@ def render_many_lights(
     Parameters
     ----------
     scene : mi.Scene, Scene, str or Path
-        Of any shapes that Mitsuba can intersect, instances and curves too; world units. A path is that of an XML file.
+        Of any shapes that Mitsuba can intersect, instances and curves too; world units. A path is that of an XML file:
+        of that, many instances become meshes first, as kernels of a thousand instances take minutes to compile.
     rows, columns : int
         That are evaluated ([HPB07] recommends two or three columns for each row).
     seconds : float, optional
@@ -240,7 +242,7 @@ def render_many_lights(
 
 
 def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> View:
-    """A scene, and one of its cameras.
+    """A scene, whose instances are meshes if there are many, and one of its cameras.
 
     Raises
     ------
@@ -248,7 +250,7 @@ def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> 
         There is no such file or camera.
     """
     if isinstance(scene, (str, Path)):
-        scene = load_mitsuba(scene)
+        scene = unfold_instances(load_mitsuba(scene))
     if isinstance(scene, Scene):
         scene = scene.mitsuba
     if isinstance(sensor, int):

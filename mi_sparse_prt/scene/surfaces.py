@@ -86,7 +86,7 @@ def read_surfaces(
     clean, limit = [], most_vertices
     for where in placed:
         mesh = (
-            where.in_world(_clean_mesh(where.shape, where.name, notes), limit)
+            where.in_world(clean_mesh(where.shape, where.name, notes), limit)
             if where.shape.is_mesh()
             else None
         )
@@ -174,7 +174,7 @@ def _tessellate(where: PlacedShape, material: Material, edge_length: float, limi
     )
 
 
-def _clean_mesh(shape: mi.Mesh, name: str, notes: Notes) -> TriangleMesh:
+def clean_mesh(shape: mi.Mesh, name: str, notes: Notes) -> TriangleMesh:
     """A Mitsuba mesh as clean triangles in world space, with the normals that Mitsuba shades with."""
     mesh = read_mesh(shape, name)
     check_geometry(mesh)

@@ -617,7 +617,7 @@ def test_cameras_and_lamps_in_media_are_named() -> None:
 
 
 def test_what_cannot_be_used_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surfaces, "_clean_mesh", lambda *_: pytest.fail("a mesh was read"))
+    monkeypatch.setattr(surfaces, "clean_mesh", lambda *_: pytest.fail("a mesh was read"))
     blob = {"type": "sdfgrid", "filename": str(SCENES / "zoo/blob.vol")}
     original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "a": blob, "b": blob})
     with pytest.raises(PrtError, match=r"^shapes '.', '.' are of type SDFGrid.*replace them by a mesh"):
