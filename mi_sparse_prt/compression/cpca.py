@@ -297,8 +297,9 @@ def _weighted(roots: Floats, products: Floats) -> Floats:
 def _combined(rows: Floats, roots: Floats, mean: Floats, products: Floats) -> Floats:
     """Weighted deviations in combinations (n, b): (b, m)."""
     weighted = _weighted(roots, products)
-    sums = weighted.sum(axis=0)
-    found = np.dot(weighted.T, rows)
+    found, sums = np.dot(weighted.T, rows), np.zeros(products.shape[1], np.float32)
+    for row in weighted:  # `sum(axis=0)` compiles for seconds
+        sums += row
     for k in range(len(sums)):
         for j in range(len(mean)):
             found[k, j] -= sums[k] * mean[j]
