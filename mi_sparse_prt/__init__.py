@@ -15,7 +15,8 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.emission.cubemap import CubemapLighting
     from mi_sparse_prt.emission.emitters import SceneEmitters
     from mi_sparse_prt.emission.environment import Environment, load_environment
-    from mi_sparse_prt.manylights.render import ManyLightsImage, render_many_lights
+    from mi_sparse_prt.manylights.image import ManyLightsImage
+    from mi_sparse_prt.manylights.render import render_many_lights
     from mi_sparse_prt.measurement.measurement import mesh_vertices
     from mi_sparse_prt.measurement.pixels import camera_pixels
     from mi_sparse_prt.precompute import precompute, precompute_glossy
@@ -40,7 +41,7 @@ _MODULES = {
     "FixedCamera": "relighting.fixed_camera",
     "GlossyTransport": "transport",
     "LightTransport": "transport",
-    "ManyLightsImage": "manylights.render",
+    "ManyLightsImage": "manylights.image",
     "Page": "relighting.viewer.export",
     "Relighter": "relighting.relighter",
     "Scene": "scene.scene",

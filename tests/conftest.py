@@ -54,9 +54,8 @@ if PINNED:
 if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores
     threadpool_limits(1, user_api="blas")  # whose threads would wait for each other
 matplotlib.use("Agg")
-importlib.import_module(
-    "mi_sparse_prt.validation.validate"
-).DPI = 60  # a third of the time of some would draw
+# coarser figures than users have: to draw them was a third of the time of some tests
+importlib.import_module("mi_sparse_prt.validation.validate").DPI = 60
 T = mi.ScalarTransform4f
 ARTEFACTS = Path(__file__).parent / "artefacts"
 GREY = ((0.5,) * 3, (0.6,) * 3, (0.7,) * 3)  # ground, ball, box

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.emission.equirectangular import pixel_solid_angles
+from mi_sparse_prt.io.image_file import read_bitmap
 
 SUFFIXES = (".exr", ".hdr", ".pfm")
 
@@ -126,14 +127,7 @@ def load_environment(path: str | os.PathLike[str]) -> Environment:
         raise PrtError(
             f"{path}: not an HDR image by its name; give a file that ends in {', '.join(SUFFIXES)}"
         )
-    if not path.is_file():
-        raise PrtError(f"{path}: no such file")
-    try:
-        bitmap = mi.Bitmap(str(path))
-    except (RuntimeError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise PrtError(f"{path}: cannot be read as an image, export it again ({reason})") from error
-    return Environment(_rgb_of(bitmap, path), source=str(path))
+    return Environment(_rgb_of(read_bitmap(path, "export it again"), path), source=str(path))
 
 
 def environment_of(emitter: mi.Emitter, height: int = 256) -> Environment:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.io.image_file import read_bitmap
 
 SUFFIX = ".exr"
 TOLERANCE = (
-    0.01  # relative 2-norm by which a picture may differ from the sum of its layers: half floats, compression
+    0.01  # relative 2-norm by which a picture may be off the sum of its layers: half floats, compression
 )
 RENDER = "render it with `mi-sparse-prt many-lights SCENE.xml -o FILE.exr --groups`"
 
@@ -65,13 +66,7 @@ def read_layers(path: str | Path) -> dict[str, Floats]:
 
 def _channels(path: Path) -> dict[str, Floats]:
     """All channels (height, width) of a file, by name."""
-    if not path.is_file():
-        raise PrtError(f"{path}: no such file")
-    try:
-        bitmap = mi.Bitmap(str(path))
-    except (RuntimeError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise PrtError(f"{path}: cannot be read as an image ({reason}); {RENDER}") from error
+    bitmap = read_bitmap(path, RENDER)
     pixels = np.atleast_3d(np.array(bitmap)).astype(np.float32)
     return {field.name: pixels[..., k] for k, field in enumerate(bitmap.struct_())}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from mi_sparse_prt.manylights.estimate import (
     published_partition,
     sum_with_error,
 )
+from mi_sparse_prt.manylights.image import ManyLightsImage, relative_error
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
 from mi_sparse_prt.manylights.samples import Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
@@ -60,70 +61,6 @@ class Costs(NamedTuple):
     row: float
     column: float
     clustering: float
-
-
-@dataclass(frozen=True)
-class ManyLightsImage:
-    """A picture, and how it came about.
-
-    Attributes
-    ----------
-    image : (height, width, 3) float32
-        Linear RGB, of the film's crop window.
-    alpha : (height, width) float32
-        Share of each pixel that is covered by what the scene shows.
-    layers : dict of str to (height, width, 3) float32
-        Of ``groups``: what each emitter of the scene adds, by name, itself where it is seen among it. Their sum is the
-        image. Under other colours and intensities of the emitters, it is another weighted sum (``mixed``).
-    report : dict
-        ``seconds`` by phase, ``rows``, ``columns``, ``samples``, ``lights`` (by emitter), ``elements_total``,
-        ``elements_evaluated``, ``estimated_error`` (relative 2-norm of the image, None where it is not known; with
-        ``compensate`` the noise of its paths is in it), ``tries`` (with ``error``: rows, columns and estimated error of
-        each), ``left_out``, ``clamp``, ``peak_memory_bytes``,
-        ``parameters``, ``seed``, ``versions``. JSON as it is.
-
-        ``left_out`` has shares of the mean radiance of the image with all light, each with its ``standard_error``:
-        ``clamped``, what the clamp cuts off, and ``specular``, light by way of mirrors and glass between samples and
-        lights. They are missing in the image, or were ``added``.
-    """
-
-    image: Floats
-    alpha: NDArray[np.float32]
-    layers: dict[str, Floats]
-    report: dict[str, Any]
-
-    def mixed(self, weights: Mapping[str, float | Sequence[float]]) -> Floats:
-        """The image (height, width, 3) under emitters of other intensities and colours: a weighted sum of layers.
-
-        Parameters
-        ----------
-        weights : dict of str to float or RGB
-            By what the radiance of each emitter is multiplied; 1 for those that are not named.
-
-        Raises
-        ------
-        PrtError
-            There are no layers, or none of that name; a weight is not one or three numbers of 0 or more.
-        """
-        if not self.layers:
-            raise PrtError("the picture has no layers to mix: render it with groups=True")
-        if unknown := [name for name in weights if name not in self.layers]:
-            raise PrtError(f"no emitter is named {unknown[0]!r}: choose from {', '.join(self.layers)}")
-        image = np.zeros_like(self.image)
-        for name, layer in self.layers.items():
-            image += layer * _rgb_weight(name, weights.get(name, 1.0))
-        return image
-
-
-def _rgb_weight(name: str, weight: float | Sequence[float]) -> Floats:
-    """One or three numbers of 0 or more."""
-    try:
-        found = np.asarray(weight, np.float32)
-    except (TypeError, ValueError):
-        found = np.full(1, np.nan, np.float32)
-    if found.shape not in ((), (3,)) or not np.all(np.isfinite(found) & (found >= 0)):
-        raise PrtError(f"the weight of {name!r} is {weight!r}: give a number of 0 or more, or three of them")
-    return found
 
 
 @dataclass(frozen=True)
@@ -242,7 +179,7 @@ def render_many_lights(
 
 
 def find_view(scene: mi.Scene | Scene | str | Path, sensor: int | mi.Sensor) -> View:
-    """A scene, whose instances are meshes if there are many, and one of its cameras.
+    """A scene, and one of its cameras; of a file, many instances are meshes.
 
     Raises
     ------
@@ -419,7 +356,7 @@ class RowColumn:
             self._announce()
             found = self._sum_of(self.reduced(self.rows))
             image = self.samples.image(found.values + self._added)
-            known = _relative(image, found.squared_error)
+            known = relative_error(image, found.squared_error)
             self.tries.append({"rows": self.rows, "columns": self.columns, "estimated_error": known})
             if preview is not None:
                 preview(image)
@@ -473,7 +410,7 @@ class RowColumn:
 
     def _report(self, image: Floats, squared_error: float) -> dict[str, Any]:
         m, n = self.elements.shape
-        error = _relative(image, squared_error)
+        error = relative_error(image, squared_error)
         return {
             "seconds": self.run.clock.report(),
             "rows": self.rows,
@@ -504,9 +441,3 @@ class RowColumn:
             for kind, (mean, error) in found.items()
         }
         return {**shares, "added": added}
-
-
-def _relative(image: Floats, squared_error: float) -> float:
-    """Relative 2-norm of an error; 0 of a black image, NaN where the error is not known."""
-    norm = float(np.square(image, dtype=np.float64).sum())
-    return float(np.sqrt(squared_error / norm)) if norm > 0 else 0.0

@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.manylights.render import ManyLightsImage, Settings, render_many_lights
+from mi_sparse_prt.manylights.image import ManyLightsImage
+from mi_sparse_prt.manylights.render import Settings, render_many_lights
 
 
 class RowColumn(mi.SamplingIntegrator):

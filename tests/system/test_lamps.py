@@ -253,6 +253,44 @@ BALLS = {
 }
 
 
+PANEL = {
+    "type": "rectangle",
+    "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),
+    "emitter": {"type": "area", "radiance": 5.0},
+}
+LIGHT = [1.0, 3.0]  # of a lamp, and of the sky
+
+
+def with_ball(bsdf: dict, lamp: dict, target: list, fov: float, size: tuple[int, int], edge_length: float):
+    """The still life and a ball under a lamp and a sky, seen from above."""
+    return build(
+        edge_length,
+        **still_life(),
+        sphere={"type": "sphere", "center": [0.2, 0.5, 1.0], "radius": 0.35, "bsdf": bsdf},
+        lamp=lamp,
+        sky={"type": "constant", "radiance": 0.2},
+        camera={
+            "type": "perspective",
+            "fov": fov,
+            "to_world": T().look_at([1.2, 1.9, 3.2], target, [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}},
+        },
+    )
+
+
+def assert_means_are_those_of_path(scene, transport, parts: dict[str, tuple], spp: int, seeds: int) -> None:
+    """Of parts of the picture, within three standard errors, each below 0.25%, and 1.25%."""
+    depth, ours = transport.max_depth, prt.render(scene, transport, LIGHT, 0, 256)
+    with transport.emission.scene_lit_by(LIGHT, scene) as lit:
+        found = np.array([path_image(lit, scene.sensor(0), depth, spp, seed) for seed in range(seeds)])
+    for name, part in parts.items():
+        means = found[:, *part].mean(axis=(1, 2, 3), dtype=np.float64)
+        noise, known = np.std(means, ddof=1) / np.sqrt(seeds), means.mean()
+        print(f"{name}: {ours[part].mean() / known - 1:+.2%}, noise {noise / known:.3%}")
+        assert ours[part].mean() == pytest.approx(known, abs=3 * noise + 0.0125 * known), name
+        assert noise < 0.0025 * known, name
+
+
 @pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("kind", BALLS)
 def test_a_picture_with_mirrors_glass_and_masks(kind):
@@ -261,37 +299,10 @@ def test_a_picture_with_mirrors_glass_and_masks(kind):
     Expected: the mean of the picture, and of the ground in front of the ball, is that of `path`, within three standard
     errors and 1.25% (interpolation). Paths are long: light of lamps is not told apart by depth.
     """
-    scene = build(
-        0.15,
-        **still_life(),
-        sphere={"type": "sphere", "center": [0.2, 0.5, 1.0], "radius": 0.35, "bsdf": BALLS[kind]},
-        lamp={
-            "type": "rectangle",
-            "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),
-            "emitter": {"type": "area", "radiance": 5.0},
-        },
-        sky={"type": "constant", "radiance": 0.2},
-        camera={
-            "type": "perspective",
-            "fov": 45,
-            "to_world": T().look_at([1.2, 1.9, 3.2], [0, 0.5, 0.3], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}},
-        },
-    )
+    scene = with_ball(BALLS[kind], PANEL, [0, 0.5, 0.3], 45, (48, 36), 0.15)
     transport = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=16, progress=False)
-    pictures = {"all": slice(None), "ground": slice(32, None)}
-    if kind == "rough glass":
-        del pictures["all"]  # the ball itself is drawn plain
-    brightness = [1.0, 3.0]
-    ours = prt.render(scene, transport, brightness, 0, 256)
-    with transport.emission.scene_lit_by(brightness, scene) as lit:
-        found = np.array([path_image(lit, scene.sensor(0), 16, 256, seed) for seed in range(8)])
-    for name, part in pictures.items():
-        means = found[:, part].mean(axis=(1, 2, 3), dtype=np.float64)
-        noise, known = np.std(means, ddof=1) / np.sqrt(8), means.mean()
-        print(f"{kind}, {name}: {ours[part].mean() / known - 1:+.2%}, noise {noise / known:.3%}")
-        assert ours[part].mean() == pytest.approx(known, abs=3 * noise + 0.0125 * known), name
-        assert noise < 0.0025 * known, name
+    parts = {"all": np.s_[:, :], "ground": np.s_[32:, :]}
+    assert_means_are_those_of_path(scene, transport, parts, spp=256, seeds=8)
 
 
 def test_the_command_line_tells_what_a_file_of_lamps_holds(transport, tmp_path):
@@ -358,41 +369,18 @@ def test_points_of_a_measurement_are_in_the_world(scene, transport):
     assert (np.einsum("nd,nd->n", points.ray_offsets, points.normals) > 0).all()
 
 
-@pytest.mark.parametrize("lamp", ["panel", "point"])
+@pytest.mark.usefixtures("no_held_out")
+@pytest.mark.parametrize(
+    "lamp", [PANEL, {"type": "point", "position": [-0.3, 2.2, 1.2], "intensity": 6.0}], ids=["panel", "point"]
+)
 def test_glossy_surfaces_show_lamps(lamp):
     """Rationale: no row tells what a golden ball reflects to the camera: its rays go on, to lamps that they can meet by
     chance, and to points that they cannot.
 
-    Expected: the mean of the ball, and of the picture, is that of `path` within three standard errors and 1.25%.
+    Expected: the mean of the ball, and of the picture, is that of `path`, within three standard errors and 1.25%.
     """
-    lamps = {
-        "panel": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),
-            "emitter": {"type": "area", "radiance": 5.0},
-        },
-        "point": {"type": "point", "position": [-0.3, 2.2, 1.2], "intensity": 6.0},
-    }
     gold = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
-    scene = build(
-        0.2,
-        **still_life(),
-        gold={"type": "sphere", "center": [0.2, 0.5, 1.0], "radius": 0.35, "bsdf": gold},
-        lamp=lamps[lamp],
-        sky={"type": "constant", "radiance": 0.2},
-        camera={
-            "type": "perspective",
-            "fov": 20,
-            "to_world": T().look_at([1.2, 1.9, 3.2], [0.2, 0.5, 1.0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}},
-        },
-    )
+    scene = with_ball(gold, lamp, [0.2, 0.5, 1.0], 20, (32, 32), 0.2)
     transport = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=4, progress=False)
-    ours, light = prt.render(scene, transport, [1.0, 3.0], 0, 256), [1.0, 3.0]
-    with transport.emission.scene_lit_by(light, scene) as lit:
-        found = np.array([path_image(lit, scene.sensor(0), 4, 256, seed) for seed in range(4)])
-    for part in (slice(None), slice(10, 22)):
-        means = found[:, part, part].mean(axis=(1, 2, 3), dtype=np.float64)
-        noise, known = np.std(means, ddof=1) / 2, means.mean()
-        assert ours[part, part].mean() == pytest.approx(known, abs=3 * noise + 0.0125 * known)
-        assert noise < 0.0025 * known
+    parts = {"all": np.s_[:, :], "ball": np.s_[10:22, 10:22]}
+    assert_means_are_those_of_path(scene, transport, parts, spp=256, seeds=4)

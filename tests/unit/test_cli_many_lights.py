@@ -71,6 +71,14 @@ def test_a_time_budget_is_kept_about(scene, tmp_path):
     assert json.loads(report.read_text())["rows"] >= 16
 
 
+def test_rows_and_columns_by_an_error(scene, tmp_path):
+    report = tmp_path / "a.json"
+    arguments = ["--lights", 200, "--max-depth", 3, "--error", 0.05, "--json", report]
+    assert call("many-lights", scene, "-o", tmp_path / "a.png", *arguments).exit_code == 0
+    found = json.loads(report.read_text())
+    assert found["tries"] and found["estimated_error"] <= 0.05
+
+
 def test_many_lights_refuses_in_one_line(scene, tmp_path):
     before = entries(tmp_path)
     image = tmp_path / "x.exr"

@@ -56,5 +56,8 @@ def page_text(name: str, scripts: Sequence[str], title: str, data: str) -> str:
     folder = files(__package__) / "page"
     script = "\n".join((folder / f"{script}.js").read_text() for script in scripts)
     style = (folder / "style.css").read_text()
-    template = Template((folder / f"{name}.html").read_text())
-    return template.substitute(title=html.escape(title), style=style, script=script, data=data)
+    content = (folder / f"{name}.html").read_text()
+    template = Template((folder / "page.html").read_text())
+    return template.substitute(
+        title=html.escape(title), style=style, name=name, content=content, script=script, data=data
+    )
