@@ -147,8 +147,10 @@ def _block(
         dr.block_reduce(dr.ReduceOp.Add, square, paths).numpy().astype(np.float64) for square in squares
     ]
     means = np.stack(sums) / paths
+    if paths == 1:
+        return means[:2].astype(np.float32), np.zeros((len(rows), 3))
     around = np.stack(second) / paths - np.square(means).sum(axis=2)
-    return means[:2].astype(np.float32), np.maximum(around, 0).T / max(paths - 1, 1)
+    return means[:2].astype(np.float32), np.maximum(around, 0).T / (paths - 1)
 
 
 @dataclass

@@ -219,6 +219,19 @@ def test_a_furnace_is_whole() -> None:
 SMALL = {"rows": 12, "columns": 20, "lights": 300, "max_depth": 4, "clamp": 0.1}
 
 
+@pytest.mark.parametrize("paths", [1, 16])
+def test_the_standard_error_of_a_share_is_told(paths: int) -> None:
+    """24 surveys of one matrix. Expected: what is told is about the spread of what they find, at most twice as much.
+
+    With one path from each sample, that samples differ counts as well.
+    """
+    elements = elements_of(corner(), 4, 4.0, 0)
+    found = [every_path(elements, seed, paths).of_image(elements.samples)["clamped"] for seed in range(24)]
+    spread, told = np.std([mean for mean, _ in found], ddof=1), np.mean([error for _, error in found])
+    print(f"spread {spread:.2e}, told {told:.2e}")
+    assert 0.5 * told < spread < 1.4 * told  # a standard deviation of 24 is known to 15%
+
+
 def test_the_image_is_the_same_in_any_block_size(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, images = corner(), []
     for lanes in (1 << 20, 3000):
