@@ -181,26 +181,16 @@ def fit_spaces(rows: Floats, weights: Floats, clusters: Clusters, bases: int, ce
 
     def fit(turns: Indices) -> None:
         for c in turns:
-            means[c], found = _space_of(rows, weights, items[c], bases, start[c], centred, random)
+            own = rows.take(items[c], axis=0).reshape(-1, m)  # where threads do not wait for each other
+            means[c], found = affine_space(
+                own, np.repeat(weights[items[c]], g), bases, start[c], centred, random
+            )
             vectors[c, : len(found)] = found
 
-    # threads of Python: in a parallel loop of numba, all of `affine_space` would be compiled three times over
     threads, sizes = numba.get_num_threads(), np.argsort(-counts, kind="stable")
     with one_blas_thread(), ThreadPoolExecutor(threads) as pool:
         list(pool.map(fit, [sizes[t::threads] for t in range(threads)]))  # large and small ones for each
     return Clusters(clusters.labels, means, vectors)
-
-
-@numba.njit(nogil=True, cache=True)
-def _space_of(
-    rows: Floats, weights: Floats, items: Indices, bases: int, start: Floats, centred: bool, random: Floats
-) -> tuple[Floats, Floats]:
-    """``affine_space`` of some items; they are gathered here, where threads do not wait for each other."""
-    g, m = rows.shape[1:]
-    own, shares = np.empty((len(items) * g, m), np.float32), np.empty(len(items) * g, np.float32)
-    for i in range(len(own)):
-        own[i], shares[i] = rows[items[i // g], i % g], weights[items[i // g]]
-    return affine_space(own, shares, bases, start, centred, random)
 
 
 def random_mixtures(rows: int, missing: int) -> Floats:
@@ -208,7 +198,6 @@ def random_mixtures(rows: int, missing: int) -> Floats:
     return np.random.default_rng(0).standard_normal((rows, max(missing, 0) + MORE), np.float32)
 
 
-@numba.njit(nogil=True, cache=True)
 def affine_space(
     rows: Floats, weights: Floats, bases: int, start: Floats, centred: bool, random: Floats
 ) -> tuple[Floats, Floats]:
@@ -224,17 +213,16 @@ def affine_space(
     if bases == 0:
         return mean, none
     if n <= bases + MORE:
-        vectors = _combined(rows, roots, mean, np.eye(n).astype(np.float32))
+        vectors = _combined(rows, roots, mean, np.eye(n, dtype=np.float32))
     else:
-        mixed = _combined(rows, roots, mean, np.ascontiguousarray(random[:n]))
+        mixed = _combined(rows, roots, mean, random[:n])
         vectors = _added(np.concatenate((start, mixed)), none)
         vectors = _combined(rows, roots, mean, _weighted(roots, _along(rows, mean, vectors)))
     vectors = _added(vectors, none)
-    turned = _principal(_weighted(roots, _along(rows, mean, vectors)), bases, np.abs(rows).max())
+    turned = _principal(_weighted(roots, _along(rows, mean, vectors)), bases, _largest(rows))
     return mean, np.dot(turned, vectors)
 
 
-@numba.njit(nogil=True, cache=True)
 def refined_space(
     rows: Floats, weights: Floats, products: Floats, centred: bool
 ) -> tuple[Floats, Floats, Floats]:
@@ -260,53 +248,44 @@ def refined_space(
     if bases == 0:
         return mean, none, np.zeros((len(rows), 0), np.float32)
     if len(rows) <= bases + MORE:
-        vectors = _added(_combined(rows, roots, mean, np.eye(len(rows)).astype(np.float32)), none)
+        vectors = _added(_combined(rows, roots, mean, np.eye(len(rows), dtype=np.float32)), none)
         along = _along(rows, mean, vectors)
-        turned = _principal(_weighted(roots, along), bases, np.abs(rows).max())
+        turned = _principal(_weighted(roots, along), bases, _largest(rows))
         return mean, np.dot(turned, vectors), np.dot(along, turned.T)
     first = _added(_combined(rows, roots, mean, _weighted(roots, products)), none)
     along = _along(rows, mean, first)
     second = _added(_combined(rows, roots, mean, _weighted(roots, along)), first)
     more = _along(rows, mean, second)
     both = np.concatenate((along, more), axis=1)
-    turned = _principal(_weighted(roots, both), bases, np.abs(rows).max())
+    turned = _principal(_weighted(roots, both), bases, _largest(rows))
     one, other = np.ascontiguousarray(turned[:, : len(first)]), np.ascontiguousarray(turned[:, len(first) :])
     return mean, np.dot(one, first) + np.dot(other, second), np.dot(both, turned.T)
 
 
-@numba.njit(nogil=True, cache=True)
 def _centre(rows: Floats, weights: Floats, centred: bool) -> tuple[Floats, Floats]:
     """Square roots (n,) of what rows count, of 1 together, and their mean (m,), or the origin."""
     share = weights / np.float32(max(weights.sum(), np.float32(1e-30)))
     return np.sqrt(share), np.dot(share, rows) if centred else np.zeros(rows.shape[1], np.float32)
 
 
-@numba.njit(nogil=True, cache=True)
 def _along(rows: Floats, mean: Floats, vectors: Floats) -> Floats:
     """Products (n, b) of deviations with vectors (b, m)."""
     return np.dot(rows, vectors.T) - np.dot(vectors, mean)
 
 
-@numba.njit(nogil=True, cache=True)
 def _weighted(roots: Floats, products: Floats) -> Floats:
     """Rows of products (n, b), times their roots."""
     return roots.reshape(-1, 1) * products
 
 
-@numba.njit(nogil=True, cache=True)
 def _combined(rows: Floats, roots: Floats, mean: Floats, products: Floats) -> Floats:
     """Weighted deviations in combinations (n, b): (b, m)."""
     weighted = _weighted(roots, products)
-    found, sums = np.dot(weighted.T, rows), np.zeros(products.shape[1], np.float32)
-    for row in weighted:  # `sum(axis=0)` compiles for seconds
-        sums += row
-    for k in range(len(sums)):
-        for j in range(len(mean)):
-            found[k, j] -= sums[k] * mean[j]
+    found = weighted.T @ rows
+    found -= weighted.sum(axis=0)[:, None] * mean
     return found
 
 
-@numba.njit(nogil=True, cache=True)
 def _added(vectors: Floats, basis: Floats) -> Floats:
     """What vectors (b, m) add to an orthonormal basis (any, m): orthonormal vectors (at most b, m).
 
@@ -322,7 +301,11 @@ def _added(vectors: Floats, basis: Floats) -> Floats:
     return np.dot(np.ascontiguousarray(turn.T), wide).astype(np.float32)
 
 
-@numba.njit(nogil=True, cache=True)
+def _largest(rows: Floats) -> float:
+    """The largest magnitude; that of all rows would be as much memory again."""
+    return max(float(rows.max()), -float(rows.min()))
+
+
 def _principal(products: Floats, bases: int, largest: float) -> Floats:
     """Combinations (at most ``bases``, b) of orthonormal vectors that are principal components.
 
