@@ -4,8 +4,9 @@
     python docs/page_speed.py bunny.html
 
 Prints JSON, medians of 15. ``script``: all that JavaScript does in a frame of a light that turns, by PBI and 30
-wavelets; ``frame``: the same with its picture (640 x 480), until one of its pixels is read; ``colours``, ``surfaces and
-background``, ``background``, ``smooth``: parts of it. Nothing else should run beside it.
+wavelets; ``light``: the same with its picture (640 x 480), until one of its pixels is read; ``view``: a frame of a
+camera that moves; ``still``: one that becomes smooth; ``colours`` of vertices and ``pixels`` are parts of these.
+Nothing else should run beside it.
 """
 
 from __future__ import annotations
@@ -31,24 +32,22 @@ const median = (work) => {
 };
 const turn = (k) => { v.set({ degrees: 3 * k, budget: 30, method: "per_band" }); v.relight(); };
 const read = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
-const draw = (smooth) => () => { v.draw(smooth); read(); };
+const draw = () => { v.draw(); read(); };
 v.pinned = v.held = true;
 v.resize(640, 480);
 v.relight("everything");
-draw(false)();
-const result = { vertices: v.scene.vertices, script: median(turn), frame: median((k) => { turn(k); draw(false)(); }) };
+draw();
+const result = { vertices: v.scene.vertices, script: median(turn), light: median((k) => { turn(k); draw(); }) };
+result.view = median(() => { v.camera.orbit(1e-3, 0); draw(); });
+result.still = median((k) => { v.picture.addSample(v.drawn, k); read(); });
 result.colours = median(() => {
   v.picture.relight(v.clusters.total);
-  gl.bindFramebuffer(gl.FRAMEBUFFER, v.picture.target);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, v.picture.colours);
   gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, values);
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
 });
-result["surfaces and background"] = median(draw(false));
-result.smooth = median(draw(true));
-const { meshes } = v.scene;
-v.scene.meshes = [];
-result.background = median(draw(false));
-v.scene.meshes = meshes;
+draw();
+result.pixels = median(draw);
 return result;
 """
 OPEN = "const done = arguments[0]; window.viewer.then((viewer) => { window.v = viewer; done(viewer !== null); });"

@@ -15,6 +15,7 @@ from pages_in_browser import (
     linear,
     open_page,
     picture,
+    pixels_of,
     radiance_file,
     sky,
     webdriver,
@@ -142,8 +143,8 @@ def test_colours_of_vertices_are_those_of_python(page, exported):
 
 
 COLOURS = """
-const { gl, target, size } = v.picture, pixels = new Float32Array(4 * size[0] * size[1]);
-gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+const { gl, colours, size } = v.picture, pixels = new Float32Array(4 * size[0] * size[1]);
+gl.bindFramebuffer(gl.FRAMEBUFFER, colours);
 gl.readPixels(0, 0, ...size, gl.RGBA, gl.FLOAT, pixels);
 gl.bindFramebuffer(gl.FRAMEBUFFER, null);
 return Array.from(pixels);
@@ -164,6 +165,42 @@ def test_surfaces_are_as_bright_as_those_of_render(page, exported):
     assert inside.mean() > 0.3
     for channel in range(3):
         assert ours[inside, channel].mean() == pytest.approx(theirs[inside, channel].mean(), rel=0.007)
+
+
+def test_what_is_kept_of_a_view_is_used_for_that_view_alone(page):
+    """Triangles of pixels are looked up again when the camera or the size is another one. Expected: the same bytes as
+    from nothing, and as before where the camera comes back.
+    """
+    show = "; v.relight('everything'); v.draw(); return v.picture.canvas.toDataURL('image/png')"
+    first = pixels_of(page.execute_script("v.set({degrees: 10})" + show))
+    for script in (
+        "v.camera.orbit(0.3, 0.1)",
+        "v.set({degrees: 80})",
+        "v.resize(200, 240)",
+        "v.camera.dolly(0.7)",
+    ):
+        kept = pixels_of(page.execute_script(script + show))
+        anew = pixels_of(page.execute_script("v.picture.view = null" + show))
+        assert np.array_equal(kept, anew), script
+    back = "v.camera.home(); v.set({degrees: 10}); v.resize(...arguments)"
+    assert np.array_equal(pixels_of(page.execute_script(back + show, *SIZE)), first)
+
+
+def test_what_stands_still_becomes_smooth(page):
+    """Frame by frame, from one sample of a pixel to four. Expected: the picture of all at once, and then no more."""
+    at_once = picture(page, "v.set({degrees: 30})")
+    steps = page.execute_script(
+        """v.moved = performance.now(); const more = [v.frame(v.moved)], pictures = [];
+        for (let k = 0; k < 4; k++) {
+          more.push(v.frame(v.moved + 1000));
+          pictures.push(v.picture.canvas.toDataURL('image/png'));
+        }
+        return [more, pictures];"""
+    )
+    assert steps[0] == [True, True, True, True, False]
+    apart = [np.abs(pixels_of(text) - at_once).mean() for text in steps[1]]
+    assert apart[-1] < 0.2 / 255 < apart[0]
+    assert max(apart[1:]) < apart[0] / 2
 
 
 def test_turning_and_moving_change_the_picture(page):

@@ -40,20 +40,21 @@ class Camera {
     this.eye = add(this.target, away, next / distance);
   }
 
-  // Projection of points, directions of places of the picture, and the eye
-  matrices(aspect) {
+  // Projection of points, directions of places of the picture, and the eye; the picture may be moved, -1 to 1 is all of it
+  matrices(aspect, [across, upwards] = [0, 0]) {
     const { right, up, back } = this.frame(), { eye, height } = this, distance = Math.hypot(...add(eye, this.target, -1));
     const near = Math.max(0.002 * distance, 1e-4 * this.scene), far = distance + 20 * this.scene;
     const y = 2 / height, x = y / aspect, z = (near + far) / (near - far), w = (2 * near * far) / (near - far);
     const rows = [
-      [...scaled(right, x), -x * dot(right, eye)],
-      [...scaled(up, y), -y * dot(up, eye)],
+      [...add(scaled(right, x), back, -across), across * dot(back, eye) - x * dot(right, eye)],
+      [...add(scaled(up, y), back, -upwards), upwards * dot(back, eye) - y * dot(up, eye)],
       [...scaled(back, z), w - z * dot(back, eye)],
       [...scaled(back, -1), dot(back, eye)],
     ];
     const projected = new Float32Array(16);
     rows.forEach((row, i) => row.forEach((value, j) => (projected[4 * j + i] = value)));
-    const towards = new Float32Array([...scaled(right, 1 / x), ...scaled(up, 1 / y), ...scaled(back, -1)]);
+    const a = scaled(right, 1 / x), b = scaled(up, 1 / y);
+    const towards = new Float32Array([...a, ...b, ...add(add(scaled(back, -1), a, -across), b, -upwards)]);
     return { projected, towards, eye };
   }
 

@@ -31,6 +31,7 @@ class Viewer {
     this.changed = true;
     this.started = this.exact = this.playing = false;
     this.moved = -1e9;
+    this.samples = 0;
   }
 
   get environment() {
@@ -92,12 +93,18 @@ class Viewer {
   }
 
   draw(smooth = false) {
-    const start = performance.now(), { state } = this;
-    this.picture.draw({
-      camera: this.camera, light: this.environment, degrees: state.degrees, exposure: 2 ** state.exposure,
-      kind: KINDS[state.colours], smooth, brightness: state.lamps[this.scene.backgroundLamp] ?? 1,
-    });
+    const start = performance.now();
+    this.picture.draw(this.drawn, smooth);
     this.milliseconds.draw = performance.now() - start;
+  }
+
+  // All that a picture is made of
+  get drawn() {
+    const { state, camera, environment } = this;
+    return {
+      camera, light: environment, degrees: state.degrees, exposure: 2 ** state.exposure, kind: KINDS[state.colours],
+      brightness: state.lamps[this.scene.backgroundLamp] ?? 1,
+    };
   }
 
   resize(width, height) {
@@ -105,14 +112,16 @@ class Viewer {
     this.touch();
   }
 
-  // All that a frame is made of; whether another is needed
+  // All that a frame is made of; whether another is needed. What stands still becomes smooth, a sample in each frame
   frame(now) {
     const moving = now - this.moved < STILL;
+    if (moving) this.samples = 0;
     if (this.changed) this.relight();
     else if (!moving && !this.exact) this.relight("everything");
     else if (this.streamed && this.streamed.old) this.streamed.send();
-    this.draw(!moving);
-    return moving;
+    if (moving) this.draw();
+    else this.picture.addSample(this.drawn, this.samples++);
+    return this.samples < SAMPLES.length;
   }
 
   drop(name, image) {

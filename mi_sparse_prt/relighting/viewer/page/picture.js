@@ -31,14 +31,72 @@ void main() {
   colour = vec4(max(total, 0.0), 1.0);
 }`;
 
-const BACKGROUND = HEAD + TONE + `
-uniform sampler2D environment, sharp;
-uniform int sharper;
+// What a pixel sees: triangle + 1 (0 is the background), place in it, albedo, mesh + 1 (0 is black). Once for each view
+const SEEN = `
+precision highp usampler2D;
+uniform usampler2D vertices; // position, 16 bits each, normal, 8 bits each, albedo, 16 bits each
+uniform mat4 projected;
+uniform vec3 low, extent, eye;
+layout(location = 0) in uint vertex;
+flat out int triangle;
+out vec2 within;
+out float seen;
+#ifdef TEXTURED
+uniform sampler2D texcoords;
+out vec2 uv;
+#else
+out vec3 albedo;
+#endif
+void main() {
+  triangle = gl_VertexID / 3;
+  int corner = gl_VertexID - 3 * triangle;
+  within = vec2(corner == 1, corner == 2);
+  ivec2 place = ivec2(vertex % ${ROW}u, vertex / ${ROW}u);
+  uvec4 words = texelFetch(vertices, place, 0);
+  vec3 where = low + extent * (vec3(words.x & 65535u, words.x >> 16, words.y & 65535u) / 65535.0);
+  vec3 normal = vec3(words.y >> 24, (words.y >> 16) & 255u, words.w >> 16) - 127.0;
+  seen = dot(normal, eye - where);
+#ifdef TEXTURED
+  uv = texelFetch(texcoords, place, 0).xy;
+#else
+  albedo = vec3(words.z & 65535u, words.z >> 16, words.w & 65535u) / 65535.0;
+#endif
+  gl_Position = projected * vec4(where, 1.0);
+}`;
+
+const PIXEL = `
+uniform int back;
+uniform uint mesh;
+flat in int triangle;
+in vec2 within;
+in float seen;
+out uvec4 pixel;
+#ifdef TEXTURED
+uniform sampler2D image;
+in vec2 uv;
+#else
+in vec3 albedo;
+#endif
+void main() {
+  if (back == 1 && seen <= 0.0) discard;
+#ifdef TEXTURED
+  vec3 albedo = texture(image, uv).rgb;
+#endif
+  uint drawn = seen > 0.0 ? mesh + 1u : 0u; // one-sided surfaces are black from behind
+  pixel = uvec4(triangle + 1, packUnorm2x16(within), packUnorm2x16(albedo.rg), packUnorm2x16(vec2(albedo.b, 0.0)) | drawn << 16);
+}`;
+
+// Radiance of pixels: as often as the light changes
+const SHADING = `
+precision highp usampler2D;
+uniform usampler2D seen, triangles;
+uniform sampler2D light, shine, environment, sharp;
+uniform int kind, sharper;
 uniform mat3 towards; // from places of the picture to the frame of the world
-uniform float degrees;
+uniform float degrees, brightness;
 in vec2 place;
 out vec4 colour;
-void main() {
+vec3 background() {
   vec3 d = normalize(towards * vec3(place, 1.0));
   vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307 + degrees / 360.0, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
   vec3 radiance = sharper == 1 ? textureLod(sharp, uv, 0.0).rgb : vec3(1.0);
@@ -46,78 +104,36 @@ void main() {
     vec3 blurred = textureLod(environment, uv, 0.0).rgb;
     radiance = sharper == 1 ? max(radiance, blurred) : blurred;
   }
-  colour = shown(radiance);
-}`;
-
-// few numbers from vertex to pixel: software renderers take as long for these as for the pixels
-const SURFACE = `
-uniform sampler2D light;
+  return radiance * brightness;
+}
+vec3 interpolated(sampler2D of, uvec3 vertices, vec3 weights) {
+  vec3 sum = vec3(0.0);
+  for (int k = 0; k < 3; k++)
+    sum += weights[k] * texelFetch(of, ivec2(vertices[k] % ${ROW}u, vertices[k] / ${ROW}u), 0).rgb;
+  return sum;
+}
+vec3 surface(uvec4 pixel) {
+  uint mesh = pixel.w >> 16;
+  if (mesh == 0u) return vec3(0.0);
+  if (kind == 3) return texelFetch(light, ivec2((mesh - 1u) % ${ROW}u, (mesh - 1u) / ${ROW}u), 0).rgb;
+  int triangle = int(pixel.x) - 1;
+  uvec3 vertices = texelFetch(triangles, ivec2(triangle % ${ROW}, triangle / ${ROW}), 0).xyz;
+  vec2 within = unpackUnorm2x16(pixel.y);
+  vec3 weights = vec3(1.0 - within.x - within.y, within), radiance = interpolated(light, vertices, weights);
+  if (kind == 0) {
+    radiance *= vec3(unpackUnorm2x16(pixel.z), unpackUnorm2x16(pixel.w).x);
 #ifdef SHINES
-uniform sampler2D shine;
-out vec3 gloss;
+    radiance += interpolated(shine, vertices, weights);
 #endif
-uniform mat4 projected;
-uniform vec3 low, extent, eye;
-uniform int kind;
-layout(location = 0) in vec3 position;
-layout(location = 1) in vec3 normal;
-layout(location = 2) in vec3 albedo;
-layout(location = 3) in vec3 cluster;
-out float seen;
-out vec3 radiance;
-#ifdef TEXTURED
-layout(location = 4) in vec2 uv;
-out vec2 texcoords;
-#endif
+  }
+  return radiance;
+}
 void main() {
-  vec3 where = low + extent * position;
-  seen = dot(normal, eye - where);
-  ivec2 own = ivec2(gl_VertexID % ${ROW}, gl_VertexID / ${ROW});
-  radiance = kind == 2 ? cluster : texelFetch(light, own, 0).rgb;
-#ifdef SHINES
-  gloss = kind == 0 ? texelFetch(shine, own, 0).rgb : vec3(0.0);
-#endif
-#ifdef TEXTURED
-  texcoords = uv;
-#else
-  if (kind == 0) radiance *= albedo;
-#endif
-  gl_Position = projected * vec4(where, 1.0);
+  uvec4 pixel = texelFetch(seen, ivec2(gl_FragCoord.xy), 0);
+  colour = shown(pixel.x == 0u ? background() : surface(pixel));
 }`;
 
-const SHADING = TONE + `
-uniform int back;
-in float seen;
-in vec3 radiance;
-out vec4 colour;
-#ifdef SHINES
-in vec3 gloss;
-#endif
-#ifdef TEXTURED
-uniform sampler2D albedos;
-in vec2 texcoords;
-#endif
-void main() {
-  if (back == 1 && seen <= 0.0) discard;
-#ifdef TEXTURED
-  vec3 leaving = radiance * texture(albedos, texcoords).rgb;
-#else
-  vec3 leaving = radiance;
-#endif
-#ifdef SHINES
-  leaving += gloss;
-#endif
-  colour = seen > 0.0 ? shown(leaving) : vec4(0.0, 0.0, 0.0, 1.0); // one-sided surfaces are black from behind
-}`;
-
-const CLUSTER = 3; // the attribute that is read for colours of clusters alone
-const ATTRIBUTES = [
-  ["positions", "UNSIGNED_SHORT", 3, true],
-  ["normals", "BYTE", 3, true],
-  ["albedo", "UNSIGNED_SHORT", 3, true],
-  ["clusterColours", "UNSIGNED_BYTE", 3, true],
-  ["texcoords", "FLOAT", 2, false],
-];
+const SAMPLES = [[1, -1], [-1, -1], [1, 1], [-1, 1]].map((offset) => offset.map((x) => x / 4)); // in a pixel, from its centre
 
 class Picture extends Drawing {
   constructor(canvas, scene) {
@@ -131,18 +147,18 @@ class Picture extends Drawing {
     const { gl, scene } = this;
     if (!gl.getExtension("EXT_color_buffer_float"))
       throw new Error("This page needs float textures (EXT_color_buffer_float), which this graphics card does not have.");
-    const head = HEAD + (scene.shines ? "#define SHINES\n" : ""), textured = head + "#define TEXTURED\n";
+    const textured = HEAD + "#define TEXTURED\n", shading = HEAD + (scene.shines ? "#define SHINES\n" : "") + TONE;
     this.programs = {
-      background: this.program(FILL, BACKGROUND),
-      plain: this.program(head + SURFACE, head + SHADING),
-      textured: this.program(textured + SURFACE, textured + SHADING),
+      plain: this.program(HEAD + SEEN, HEAD + PIXEL),
+      textured: this.program(textured + SEEN, textured + PIXEL),
+      shading: this.program(FILL, shading + SHADING),
     };
     this.size = [ROW, Math.ceil(scene.vertices / ROW)];
     if (scene.streamed) this.prepareStreamed();
     else this.prepareClusters();
     this.environments = new Map();
     this.albedos = scene.images.map((image) => this.image(image, gl.REPEAT));
-    this.smooth = null;
+    this.view = this.mean = null;
     this.geometry();
   }
 
@@ -171,8 +187,8 @@ class Picture extends Drawing {
     }
     this.coefficients = this.texture(gl.RGBA32F, scene.vectors + 1, scene.clusters, gl.RGBA, gl.FLOAT, null);
     this.light = this.texture(gl.RGBA32F, ROW, rows, gl.RGBA, gl.FLOAT, null);
-    this.target = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    this.colours = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.colours);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }
@@ -188,24 +204,27 @@ class Picture extends Drawing {
     });
   }
 
+  // What is drawn are corners of triangles, each with the number of its vertex, which it looks up in a texture
   geometry() {
-    const { gl, scene } = this;
-    this.surfaces = gl.createVertexArray();
-    gl.bindVertexArray(this.surfaces);
-    ATTRIBUTES.forEach(([name, type, count, normalized], location) => {
-      const values = scene.arrays[name];
-      if (!values || !values.length) return;
-      // rows of 3 small numbers are padded to 4 bytes: what drivers read as it is
-      const own = count === 3 ? quadrupled(values) : values;
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, own, gl.STATIC_DRAW);
-      gl.enableVertexAttribArray(location);
-      gl.vertexAttribPointer(location, count, gl[type], normalized, count === 3 ? 4 * own.BYTES_PER_ELEMENT : 0, 0);
-    });
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(scene.arrays.triangles), gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
+    const { gl, scene } = this, { arrays } = scene, rows = this.size[1], corners = new Uint32Array(arrays.triangles);
+    this.corners = gl.createVertexArray();
+    gl.bindVertexArray(this.corners);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     this.nothing = gl.createVertexArray();
+    gl.bindVertexArray(this.nothing);
+    const three = (kind, format, type, values) => {
+      const lines = Math.ceil(values.length / (3 * ROW));
+      return this.texture(kind, ROW, lines, format, type, padded(values, 3 * ROW * lines));
+    };
+    this.triangles = three(gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, corners);
+    this.vertices = this.texture(gl.RGBA32UI, ROW, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, vertexWords(arrays, ROW * rows));
+    this.clusterColours = arrays.clusterColours ? three(gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, arrays.clusterColours) : this.light;
+    if (arrays.texcoords) this.texcoords = this.texture(gl.RG32F, ROW, rows, gl.RG, gl.FLOAT, padded(arrays.texcoords, 2 * ROW * rows));
+    const errors = scene.meshes.flatMap(({ name }) => (scene.errors && scene.errors[name] ? scene.errors[name].colour : [0.2, 0.2, 0.2]));
+    this.errors = three(gl.RGB32F, gl.RGB, gl.FLOAT, Float32Array.from(errors));
   }
 
   // Textures of an environment, made when it is seen first: radiance, and a sharper image if it has one
@@ -246,7 +265,7 @@ class Picture extends Drawing {
     this.bind(0, gl.TEXTURE_2D, this.labels, uniforms.labels);
     this.bind(1, gl.TEXTURE_2D_ARRAY, this.weights, uniforms.weights);
     this.bind(2, gl.TEXTURE_2D, this.coefficients, uniforms.coefficients);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.colours);
     gl.viewport(0, 0, ...this.size);
     gl.disable(gl.DEPTH_TEST);
     gl.bindVertexArray(this.nothing);
@@ -254,89 +273,110 @@ class Picture extends Drawing {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }
 
-  // What the camera sees; smooth pictures have four samples in each pixel
-  draw({ camera, light, degrees, exposure, brightness, kind, smooth: asked }) {
-    const { gl, canvas } = this, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE);
-    const smooth = asked && 2 * Math.max(canvas.width, canvas.height) <= most;
-    const scale = smooth ? 2 : 1, width = scale * canvas.width, height = scale * canvas.height;
-    if (smooth) this.beginSmooth(width, height);
-    gl.viewport(0, 0, width, height);
-    gl.clear(gl.DEPTH_BUFFER_BIT);
-    gl.enable(gl.DEPTH_TEST);
-    gl.depthFunc(gl.LEQUAL);
-    const view = camera.matrices(width / height);
-    this.drawSurfaces(view, exposure, kind);
-    const { program, uniforms } = this.programs.background;
-    gl.useProgram(program);
-    const { radiance, image } = this.environment(light);
-    this.bind(0, gl.TEXTURE_2D, radiance, uniforms.environment);
-    this.bind(1, gl.TEXTURE_2D, image || radiance, uniforms.sharp);
-    gl.uniform1i(uniforms.sharper, image ? 1 : 0);
-    gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
-    gl.uniform1f(uniforms.degrees, degrees);
-    gl.uniform1f(uniforms.exposure, exposure * brightness);
-    gl.bindVertexArray(this.nothing);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-    if (smooth) this.endSmooth(width, height);
+  // What the camera sees, by one sample in each pixel, or the mean of four
+  draw(shown, smooth) {
+    if (!smooth) return this.drawSample(shown, 0);
+    SAMPLES.forEach((_, k) => this.addSample(shown, k));
   }
 
-  drawSurfaces(view, exposure, kind) {
-    const { gl, scene } = this;
-    gl.bindVertexArray(this.surfaces);
-    if (kind === 2) gl.enableVertexAttribArray(CLUSTER);
-    else gl.disableVertexAttribArray(CLUSTER);
+  // The mean of this sample and those before it
+  addSample(shown, k) {
+    const { gl, canvas } = this, { width, height } = canvas;
+    this.mean = this.target(this.mean, width, height, gl.RGBA16F, false);
+    // the last one is that of a light that turns
+    this.drawSample(shown, (k + 1) % SAMPLES.length, this.mean.framebuffer, 1 / (k + 1));
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.mean.framebuffer);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+
+  drawSample({ camera, light, degrees, exposure, brightness, kind }, sample, framebuffer = null, share = 1) {
+    const { gl, canvas, scene } = this, { width, height } = canvas;
+    const view = camera.matrices(width / height, SAMPLES[sample].map((x, axis) => (2 * x) / [width, height][axis]));
+    this.see(view, width, height);
+    const { program, uniforms } = this.programs.shading, { radiance, image } = this.environment(light);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(program);
+    this.bind(0, gl.TEXTURE_2D, this.view.texture, uniforms.seen);
+    this.bind(1, gl.TEXTURE_2D, this.triangles, uniforms.triangles);
+    this.bind(2, gl.TEXTURE_2D, [this.light, this.light, this.clusterColours, this.errors][kind], uniforms.light);
+    this.bind(3, gl.TEXTURE_2D, radiance, uniforms.environment);
+    this.bind(4, gl.TEXTURE_2D, image || radiance, uniforms.sharp);
+    if (scene.shines) this.bind(5, gl.TEXTURE_2D, this.shine, uniforms.shine);
+    gl.uniform1i(uniforms.sharper, image ? 1 : 0);
+    gl.uniform1i(uniforms.kind, kind);
+    gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
+    gl.uniform1f(uniforms.degrees, degrees);
+    gl.uniform1f(uniforms.brightness, brightness);
+    gl.uniform1f(uniforms.exposure, exposure);
+    gl.bindVertexArray(this.nothing);
+    if (share < 1) gl.enable(gl.BLEND);
+    gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
+    gl.blendColor(0, 0, 0, share);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
+  }
+
+  // What each pixel sees, if the view is another one than the last
+  see({ projected, eye }, width, height) {
+    const { gl, scene } = this, view = this.target(this.view, width, height, gl.RGBA32UI, true);
+    if (view === this.view && projected.every((value, k) => value === view.projected[k])) return;
+    this.view = Object.assign(view, { projected });
+    gl.bindFramebuffer(gl.FRAMEBUFFER, view.framebuffer);
+    gl.viewport(0, 0, width, height);
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    gl.clearBufferfv(gl.DEPTH, 0, [1]);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+    gl.bindVertexArray(this.corners);
     for (const name of ["plain", "textured"]) {
       const { program, uniforms } = this.programs[name];
       gl.useProgram(program);
-      this.bind(0, gl.TEXTURE_2D, this.light, uniforms.light);
-      gl.uniformMatrix4fv(uniforms.projected, false, view.projected);
+      this.bind(0, gl.TEXTURE_2D, this.vertices, uniforms.vertices);
+      if (name === "textured" && this.texcoords) this.bind(1, gl.TEXTURE_2D, this.texcoords, uniforms.texcoords);
+      gl.uniformMatrix4fv(uniforms.projected, false, projected);
       gl.uniform3fv(uniforms.low, scene.low);
       gl.uniform3fv(uniforms.extent, scene.extent);
-      gl.uniform3fv(uniforms.eye, view.eye);
-      gl.uniform1f(uniforms.exposure, exposure);
-      gl.uniform1i(uniforms.kind, Math.min(kind, 2));
-      if (scene.shines) this.bind(2, gl.TEXTURE_2D, this.shine, uniforms.shine);
-      for (const mesh of scene.meshes)
-        if ((mesh.texture !== null && kind === 0) === (name === "textured")) this.drawMesh(mesh, uniforms, kind);
+      gl.uniform3fv(uniforms.eye, eye);
+      scene.meshes.forEach((mesh, k) => {
+        if ((mesh.texture !== null) === (name === "textured")) this.drawMesh(mesh, k, uniforms);
+      });
     }
   }
 
-  drawMesh(mesh, uniforms, kind) {
-    const { gl, scene } = this;
-    if (kind === 3) gl.vertexAttrib3fv(CLUSTER, scene.errors[mesh.name] ? scene.errors[mesh.name].colour : [0.2, 0.2, 0.2]);
-    if (uniforms.albedos) this.bind(1, gl.TEXTURE_2D, this.albedos[mesh.texture], uniforms.albedos);
+  drawMesh(mesh, number, uniforms) {
+    const { gl } = this;
+    if (uniforms.image) this.bind(2, gl.TEXTURE_2D, this.albedos[mesh.texture], uniforms.image);
     gl.uniform1i(uniforms.back, mesh.back ? 1 : 0);
+    gl.uniform1ui(uniforms.mesh, number);
     if (mesh.back) gl.enable(gl.POLYGON_OFFSET_FILL); // it lies where its front lies
     gl.polygonOffset(-1, -1);
-    gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 4 * mesh.first);
+    gl.drawArrays(gl.TRIANGLES, mesh.first, mesh.count);
     gl.disable(gl.POLYGON_OFFSET_FILL);
   }
 
-  beginSmooth(width, height) {
+  // A texture that is drawn into: the old one if it has this size
+  target(old, width, height, kind, hasDepth) {
     const { gl } = this;
-    if (!this.smooth || this.smooth.width !== width || this.smooth.height !== height) {
-      if (this.smooth) this.smooth.buffers.forEach((buffer) => gl.deleteRenderbuffer(buffer));
-      const framebuffer = this.smooth ? this.smooth.framebuffer : gl.createFramebuffer();
-      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-      const buffers = [[gl.RGBA8, gl.COLOR_ATTACHMENT0], [gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT]].map(([kind, place]) => {
-        const buffer = gl.createRenderbuffer();
-        gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
-        gl.renderbufferStorage(gl.RENDERBUFFER, kind, width, height);
-        gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, buffer);
-        return buffer;
-      });
-      this.smooth = { framebuffer, buffers, width, height };
+    if (old && old.width === width && old.height === height) return old;
+    if (old) gl.deleteTexture(old.texture);
+    if (old && old.depth) gl.deleteRenderbuffer(old.depth);
+    const framebuffer = old ? old.framebuffer : gl.createFramebuffer(), texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, kind, width, height);
+    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    const depth = hasDepth ? gl.createRenderbuffer() : null;
+    if (depth) {
+      gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
     }
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.smooth.framebuffer);
-  }
-
-  endSmooth(width, height) {
-    const { gl } = this;
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.smooth.framebuffer);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    // linear, at half the size: the mean of 2 x 2
-    gl.blitFramebuffer(0, 0, width, height, 0, 0, width / 2, height / 2, gl.COLOR_BUFFER_BIT, gl.LINEAR);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return { framebuffer, texture, depth, width, height };
   }
 }
 
@@ -346,8 +386,16 @@ function padded(values, length) {
   return result;
 }
 
-function quadrupled(values) {
-  const result = new values.constructor((4 * values.length) / 3);
-  for (let k = 0; 3 * k < values.length; k++) for (let c = 0; c < 3; c++) result[4 * k + c] = values[3 * k + c];
-  return result;
+// Position, normal and albedo of each vertex in four words
+function vertexWords({ positions, normals, albedo }, count) {
+  const words = new Uint32Array(4 * count);
+  for (let k = 0; 3 * k < positions.length; k++) {
+    const [x, y, z] = positions.subarray(3 * k), [red, green, blue] = albedo.subarray(3 * k);
+    const [a, b, c] = Array.from(normals.subarray(3 * k, 3 * k + 3), (n) => n + 127);
+    words[4 * k] = x | (y << 16);
+    words[4 * k + 1] = z | (b << 16) | (a << 24);
+    words[4 * k + 2] = red | (green << 16);
+    words[4 * k + 3] = blue | (c << 16);
+  }
+  return words;
 }
