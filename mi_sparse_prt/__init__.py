@@ -15,6 +15,7 @@ if _TYPE_CHECKING:  # at run time: on first use, from the modules below
     from mi_sparse_prt.emission.cubemap import CubemapLighting
     from mi_sparse_prt.emission.emitters import SceneEmitters
     from mi_sparse_prt.emission.environment import Environment, load_environment
+    from mi_sparse_prt.manylights.frames import render_many_lights_frames
     from mi_sparse_prt.manylights.image import ManyLightsImage
     from mi_sparse_prt.manylights.render import render_many_lights
     from mi_sparse_prt.measurement.measurement import mesh_vertices
@@ -61,6 +62,7 @@ _MODULES = {
     "precompute_glossy": "precompute",
     "render": "relighting.image",
     "render_many_lights": "manylights.render",
+    "render_many_lights_frames": "manylights.frames",
     "show": "relighting.viewer.widget",
     "validate": "validation.validate",
 }
@@ -93,6 +95,7 @@ __all__ = [
     "precompute_glossy",
     "render",
     "render_many_lights",
+    "render_many_lights_frames",
     "show",
     "validate",
     "variant",

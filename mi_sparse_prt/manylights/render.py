@@ -330,9 +330,8 @@ class RowColumn:
 
     def estimate(self, preview: Callable[[Floats], object] | None = None) -> Estimate:
         """All steps; within a time budget, rows and columns by what a few of them cost."""
-        if not len(self.samples) or not len(self.lights):
-            self.rows = self.columns = 0
-            return Estimate(np.zeros((len(self.samples), 3), np.float32), 0.0)
+        if self._is_dark():
+            return self._nothing()
         if self.settings.error is not None:
             return self._until_good(self.settings.error, preview)
         if self.settings.seconds is not None or self.run.progress:
@@ -344,7 +343,14 @@ class RowColumn:
         if preview is not None:
             rough = self.partition(reduced, -(-self.columns // EARLY))
             preview(self.samples.image(self.summed(reduced, rough).values + self._added))
-        return self._sum_of(reduced)
+        return self.estimate_from(reduced)
+
+    def _is_dark(self) -> bool:
+        return not len(self.samples) or not len(self.lights)
+
+    def _nothing(self) -> Estimate:
+        self.rows = self.columns = 0
+        return Estimate(np.zeros((len(self.samples), 3), np.float32), 0.0)
 
     def _until_good(self, error: float, preview: Callable[[Floats], object] | None) -> Estimate:
         """Ever more rows and columns, from new ones: all tries but the last take about as long as that one."""
@@ -354,7 +360,7 @@ class RowColumn:
             self.rows, self.columns = min(round(rows), m), min(round(COLUMNS_PER_ROW * rows), n)
             every = self.rows == m and self.columns == n
             self._announce()
-            found = self._sum_of(self.reduced(self.rows))
+            found = self.estimate_from(self.reduced(self.rows))
             image = self.samples.image(found.values + self._added)
             known = relative_error(image, found.squared_error)
             self.tries.append({"rows": self.rows, "columns": self.columns, "estimated_error": known})
@@ -366,7 +372,10 @@ class RowColumn:
                 return found
             rows, spent = growth * rows, now
 
-    def _sum_of(self, reduced: ReducedColumns) -> Estimate:
+    def estimate_from(self, reduced: ReducedColumns) -> Estimate:
+        """From columns that are reduced already, by rows of this or of other views."""
+        if self._is_dark():
+            return self._nothing()
         self.rows = min(self.rows, len(self.samples))
         if self.settings.groups:
             return self._by_group(reduced)
