@@ -72,10 +72,10 @@ class Clustered(Operator):
         return super().apply(x)
 
     def _apply(self, x: Floats) -> Floats:
-        channels = [
-            self._combined(*self._products(x[:, c]), slice(c, c + 1))[:, 0] for c in range(x.shape[1])
-        ]
-        return np.stack(channels, axis=1)
+        result = np.empty((len(self.labels), *x.shape[1:]), np.float32)
+        for c in range(x.shape[1]):
+            self._combine(*self._products(x[:, c]), slice(c, c + 1), result[:, c : c + 1])
+        return result
 
     def _adjoint(self, y: Floats) -> Floats:
         """By clusters, not by rows: ``y`` is gathered in coefficients of means and of basis vectors."""
@@ -107,15 +107,18 @@ class Clustered(Operator):
             self.bases.reshape(k * b, m), scaled
         ).reshape(k, b, vectors.shape[1])
 
-    def _combined(self, means: Floats, products: Floats, channels: slice = slice(None)) -> Floats:
+    def _combined(self, means: Floats, products: Floats) -> Floats:
         """What rows have where means have (k, any) and basis vectors (k, b, any): (n, channels, any)."""
-        coefficients = self.coefficients[:, channels]
-        result = np.empty((*coefficients.shape[:2], means.shape[1]), np.float32)
+        result = np.empty((*self.coefficients.shape[:2], means.shape[1]), np.float32)
+        self._combine(means, products, slice(None), result)
+        return result
+
+    def _combine(self, means: Floats, products: Floats, channels: slice, result: Floats) -> None:
+        """The same of some channels, into (n, channels, any)."""
         for c in range(len(means)):
             here = np.flatnonzero(self.labels == c)
-            along = coefficients[here].astype(np.float32)  # [vertex, channel, vector]
+            along = self.coefficients[here, channels].astype(np.float32)  # [vertex, channel, vector]
             result[here] = along @ products[c] + means[c]
-        return result
 
     def _scale(self) -> Floats:
         return np.sqrt(self.lighting.solid_angles, dtype=np.float32)

@@ -22,6 +22,8 @@ from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_overlapped
 
 Ids = NDArray[np.integer]
+MANY = 64  # vectors of which a product takes longer than to copy some columns of a matrix
+
 Floats = NDArray[np.float32]
 
 ROWS = 2048  # expanded at a time
@@ -301,9 +303,15 @@ class Masked(Operator):
 
 
 def multiply_converted(matrix: NDArray[Any], vectors: Floats) -> Floats:
-    """``matrix @ vectors``; the matrix (n, m) holds small numbers, converted to float32 on the way."""
+    """``matrix @ vectors``; the matrix (n, m) holds small numbers, converted to float32 on the way.
+
+    Of many vectors, what is zero in all of them is left out, such as the ground under skies.
+    """
     product = np.empty((len(matrix), vectors.shape[1]), dtype=np.float32)
+    lit = vectors.any(axis=1) if vectors.shape[1] >= MANY else np.ones(len(vectors), bool)
+    columns = slice(None) if lit.all() else np.flatnonzero(lit)
+    vectors = vectors[columns]
     block = 2048  # rows at a time
     for a in range(0, len(matrix), block):
-        product[a : a + block] = as_floats(matrix[a : a + block]) @ vectors
+        product[a : a + block] = as_floats(matrix[a : a + block][:, columns]) @ vectors
     return product

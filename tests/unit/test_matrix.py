@@ -148,6 +148,18 @@ def test_many_lights_are_those_one_by_one(transport):
     assert transport.relight_many([]).shape == (N_V, 3, 0)
 
 
+def test_nights_and_dark_ground_change_nothing(transport):
+    """Lights that are black, and texels that all are black at, are left out. Expected: as one by one; nights are 0."""
+    lights = np.random.default_rng(3).random((6 * N * N, 3, 70), dtype=np.float32)
+    lights[: 2 * N * N] = 0
+    lights[:, :, [4, 5, 40]] = 0
+    expected = np.stack([transport.relight(lights[:, :, k]) for k in range(70)], axis=2)
+    for together in (2, 70):
+        found = transport.relight_many(lights, together=together)
+        assert close(found, expected)
+        assert not found[:, :, [4, 5, 40]].any()
+
+
 def test_many_lights_that_are_none(transport):
     lights = np.ones((6 * N * N, 3, 2), np.float32)
     with pytest.raises(prt.PrtError, match="1 or more"):
