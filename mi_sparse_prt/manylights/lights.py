@@ -323,13 +323,13 @@ def _placed(source: _Source, power: Doubles) -> _Part:
 def _area(source: _Source, number: int, count: int, seed: int) -> _Part:
     """Stratified points on an area lamp."""
     size = _square(count)
-    shape = mi.ShapePtr(source.emitters[number].get_shape())
+    shape = source.emitters[number].get_shape()  # a pointer would ask curves, too: they have none
     uv = _stratified(count, _random(size, seed, _AREAS + number))
     found = shape.sample_position(mi.Float(0), uv)
     si = dr.zeros(mi.SurfaceInteraction3f, size)
     si.p, si.n, si.uv, si.wi = found.p, found.n, found.uv, mi.Vector3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(found.n)
-    si.t, si.shape = mi.Float(0), shape
+    si.t, si.shape = mi.Float(0), mi.ShapePtr(shape)
     radiance = mi.Color3f(source.emitters[number].eval(si)) + dr.zeros(mi.Color3f, size)
     lights = no_lights(size)
     lights.kind = dr.full(mi.UInt32, COSINE, size)

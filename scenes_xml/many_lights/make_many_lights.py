@@ -1,7 +1,8 @@
 """Writes scenes that are lit by many lights, of the kinds in [HPB07]: y is up, units are metres.
 
 A colonnade under sun and sky, most of what is seen lit by interreflection; a room of glossy materials whose lamps are
-behind corners; a bush of leaves among lamps; a hall with lamps in recesses, each of which lights a place of its own.
+behind corners; a bush of leaves among lamps; a hall with lamps in recesses, each of which lights a place of its own;
+a head of hair among lamps.
 
 ``python scenes_xml/many_lights/make_many_lights.py`` from anywhere writes the same files again; a folder as argument
 takes them instead.
@@ -9,6 +10,8 @@ takes them instead.
 
 from __future__ import annotations
 
+import math
+import random
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -237,10 +240,56 @@ def hall() -> str:
     )
 
 
+def hair() -> str:
+    """Curves with a BSDF of their own: neither rows nor columns are smooth, and nothing is a triangle."""
+    things = [
+        diffuse("skin", (0.55, 0.4, 0.32)),
+        diffuse("sand", (0.46, 0.42, 0.34)),
+        '<bsdf type="hair" id="fibre"><float name="eumelanin" value="0.6"/>'
+        '<float name="pheomelanin" value="0.4"/></bsdf>',
+        '<shape type="sphere" id="head"><point name="center" value="0, 0.8, 0"/><float name="radius" value="0.5"/>'
+        '<ref id="skin"/></shape>',
+        '<shape type="bsplinecurve" id="strands"><string name="filename" value="strands.txt"/>'
+        '<ref id="fibre"/></shape>',
+        box("ground", (-4, -0.2, -4), (4, 0, 4), "sand"),
+        '<emitter type="constant" id="sky"><rgb name="radiance" value="0.05, 0.06, 0.08"/></emitter>',
+        panel("lantern", (0.6, 2.6, 0.8), (0.3, 0.3), (12, 11, 9)),
+        bulb("left", (-1.3, 0.9, 0.9), (0.8, 0.6, 0.4)),
+        bulb("behind", (0.4, 1.4, -1.4), (1.2, 1.1, 1)),
+    ]
+    return scene("A head of hair among lamps.", 34, ((0.9, 1.3, 3.4), (0, 0.75, 0)), things)
+
+
+def strands(count: int = 1500) -> str:
+    """Control points and radii of hair that falls from a head: a line each, strands apart."""
+    rng, found = random.Random(1), []
+    for _ in range(count):
+        height, azimuth = rng.uniform(-0.1, 1), rng.uniform(0, 2 * math.pi)
+        ring = math.sqrt(max(1 - height * height, 0))
+        out = (ring * math.cos(azimuth), height, ring * math.sin(azimuth))
+        bend, length = rng.uniform(0.7, 1.1), rng.uniform(0.45, 0.6)
+        lines = []
+        for k in range(7):
+            t = k / 6
+            reach = 0.47 + length * t * (1 - 0.45 * t)
+            fall = bend * length * t * t
+            sway = 0.03 * t * rng.uniform(-1, 1)
+            point = (out[0] * reach + sway, 0.8 + out[1] * reach - fall, out[2] * reach + sway)
+            lines.append(" ".join(f"{x:.3f}" for x in point) + f" {0.006 * (1 - 0.6 * t):.4f}")
+        found.append("\n".join(lines))
+    # Mitsuba 3.9 reads beyond its arrays at the very end of the last one: that is where no ray comes
+    found.append("\n".join(f"0 {0.7 + 0.03 * k:.2f} 0 0.001" for k in range(7)))
+    return "\n\n".join(found) + "\n"
+
+
+SCENES = {"colonnade": colonnade, "room": room, "leaves": leaves, "hall": hall, "hair": hair}
+
+
 def main(folder: Path = Path(__file__).parent) -> None:
     """Write all of them."""
-    for name, text in {"colonnade": colonnade(), "room": room(), "leaves": leaves(), "hall": hall()}.items():
-        (folder / f"{name}.xml").write_text(text)
+    for name, make in SCENES.items():
+        (folder / f"{name}.xml").write_text(make())
+    (folder / "strands.txt").write_text(strands())
 
 
 if __name__ == "__main__":
