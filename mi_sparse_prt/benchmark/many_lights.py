@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from mi_sparse_prt.core.profiling import peak_memory, reset_peak_memory
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.manylights.baselines import all_lights, draw_by_power, instant_radiosity
 from mi_sparse_prt.manylights.elements import Elements, Floats
+from mi_sparse_prt.manylights.lightcuts import lightcuts
 from mi_sparse_prt.manylights.render import METHODS, RowColumn, Settings, find_view, matrix_of
 from mi_sparse_prt.scene.loading import load_mitsuba
 from mi_sparse_prt.validation.validate import save_figures
@@ -26,6 +28,7 @@ RATIOS = {"1:1": 1.0, "1:2": 2.0, "1:3": 3.0, "3:1": 1 / 3}  # rows to columns (
 SIZES = 100, 400, 1200  # rows and columns together
 SETTINGS = (100, 100), (300, 900)  # of [HPB07] Table 2
 LIGHTS = 100, 500, 2500  # of the baselines
+CUTS = 0.1, 0.05, 0.02  # thresholds of lightcuts, in diffuse scenes
 PATH_SPP = 1, 4, 16, 64
 COUNT = 100_000  # lights in all
 SEEDS = 2
@@ -120,13 +123,16 @@ class _Bench:
     def curves(self, run: Run) -> dict[str, list[dict[str, Any]]]:
         """Of both methods at all ratios, and of the baselines."""
         found = {}
-        with run.bar(len(METHODS) * len(RATIOS) + 2, "curves", " curves") as bar:
+        baselines: dict[str, Sequence[float]] = {"instant radiosity": LIGHTS, "power sampling": LIGHTS}
+        if self._elements.surfaces.all_lambertian:
+            baselines["lightcuts"] = CUTS
+        with run.bar(len(METHODS) * len(RATIOS) + len(baselines), "curves", " curves") as bar:
             for method in METHODS:
                 for name, ratio in RATIOS.items():
                     found[f"{method} {name}"] = self.curve(method, ratio)
                     bar.update()
-            for name in ("instant radiosity", "power sampling"):
-                found[name] = self.baseline(name)
+            for name, sizes in baselines.items():
+                found[name] = self.baseline(name, sizes)
                 bar.update()
         return found
 
@@ -170,18 +176,18 @@ class _Bench:
         predicted = math.sqrt(estimate.squared_error / square) if known and square > 0 else None
         return seconds, float(relative_l2(image, self._reference)), predicted, image
 
-    def baseline(self, name: str) -> list[dict[str, Any]]:
-        """Instant radiosity or power sampling: a point for each number of lights."""
+    def baseline(self, name: str, sizes: Sequence[float]) -> list[dict[str, Any]]:
+        """A point for each number of lights, or for each error that lightcuts allow."""
         points = []
-        for count in LIGHTS:
+        for size in sizes:
             seconds, errors = [], []
             for seed in range(self._seeds):
-                took, image = timed(self._baseline_image, name, count, 1 + seed)
+                took, image = timed(self._baseline_image, name, size, 1 + seed)
                 seconds.append(took)
                 errors.append(float(relative_l2(image, self._reference)))
             points.append(
                 {
-                    "lights": count,
+                    "threshold" if name == "lightcuts" else "lights": size,
                     "seconds": float(np.median(seconds)),
                     "error": float(np.sqrt(np.mean(np.square(errors)))),
                     "spread": float(np.std(errors, ddof=1)) if len(errors) > 1 else 0.0,
@@ -191,12 +197,14 @@ class _Bench:
             self.pictures[name] = image
         return points
 
-    def _baseline_image(self, name: str, count: int, seed: int) -> Floats:
-        if name == "instant radiosity":
+    def _baseline_image(self, name: str, size: float, seed: int) -> Floats:
+        if name == "lightcuts":
+            values = lightcuts(self._elements, seed, size)
+        elif name == "instant radiosity":
             options = replace(self._settings, seed=seed).light_options()
-            values = instant_radiosity(self._elements, count, options)
+            values = instant_radiosity(self._elements, int(size), options)
         else:
-            chosen = draw_by_power(self._elements.lights.flux, count, np.random.default_rng(seed))
+            chosen = draw_by_power(self._elements.lights.flux, int(size), np.random.default_rng(seed))
             values = self._elements.sum_columns(*chosen)
         return self._elements.samples.image(values)
 

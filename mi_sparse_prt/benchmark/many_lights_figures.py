@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.validation.matrix_figures import panels
 
-COLOURS = {"hasan2007": "C0", "adaptive": "C3", "instant radiosity": "C2", "power sampling": "C4"}
+COLOURS = {
+    "hasan2007": "C0",
+    "adaptive": "C3",
+    "instant radiosity": "C2",
+    "power sampling": "C4",
+    "lightcuts": "C1",
+}
 STYLES = {"1:1": "-", "1:2": "--", "1:3": "-.", "3:1": ":"}
 
 

@@ -97,13 +97,24 @@ class Elements:
         found = np.zeros((len(rows), len(columns), 3), np.float32)
         step = max(1, LANES // max(len(columns), 1))
         for a in range(0, len(rows) if len(columns) else 0, step):
-            part = np.asarray(rows[a : a + step], np.uint32)
-            i = mi.UInt32(np.repeat(part, len(columns)))
-            j = mi.UInt32(np.tile(np.asarray(columns, np.uint32), len(part)))
-            value = self.element(self.samples.receivers(i), self.lights.arrays.take(j), mi.Mask(True))
-            found[a : a + step] = value.numpy().T.reshape(len(part), len(columns), 3)
-        self.evaluated += found[..., 0].size
-        self._check(found.reshape(-1, 3), np.repeat(rows, len(columns)), np.tile(columns, len(rows)))
+            part = np.asarray(rows[a : a + step])
+            values = self.pairs(np.repeat(part, len(columns)), np.tile(columns, len(part)))
+            found[a : a + step] = values.reshape(len(part), len(columns), 3)
+        return found
+
+    def pairs(self, rows: Ids, columns: Ids) -> Floats:
+        """Elements (k, 3), one for each pair of a row and a column.
+
+        Raises
+        ------
+        PrtError
+            One is not finite.
+        """
+        i, j = (mi.UInt32(np.asarray(ids, np.uint32)) for ids in (rows, columns))
+        value = self.element(self.samples.receivers(i), self.lights.arrays.take(j), mi.Mask(True))
+        found = np.ascontiguousarray(value.numpy().T)
+        self.evaluated += len(found)
+        self._check(found, np.asarray(rows), np.asarray(columns))
         return found
 
     def rows(self, ids: Ids) -> Floats:
