@@ -42,6 +42,13 @@ def _left_out(report: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
+def _size(point: dict[str, Any]) -> str:
+    """Of a point of a curve."""
+    if "rows" in point:
+        return f"{point['rows']}/{point['columns']}"
+    return f"{point['lights']} lights" if "lights" in point else f"up to {percent(point['threshold'])}"
+
+
 def many_lights_tables(report: dict[str, Any]) -> list[Table]:
     """What ``measure_many_lights`` found: time against error, and a table as [HPB07] has it."""
     size, machine, whole = report["scene"], report["machine"], report["all_lights"]["seconds"]
@@ -53,7 +60,7 @@ def many_lights_tables(report: dict[str, Any]) -> list[Table]:
         [
             (
                 name if k == 0 else "",
-                f"{p['rows']}/{p['columns']}" if "rows" in p else f"{p['lights']} lights",
+                _size(p),
                 duration(p["seconds"]),
                 percent(p["error"]),
                 percent(p["spread"]),
