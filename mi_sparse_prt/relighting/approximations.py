@@ -314,7 +314,8 @@ def _largest_of_bands(
         mode, band = which // bands, which % bands
         own = values[mode, offsets[band] : offsets[band + 1]]
         length = keep_largest(own, count, sizes[mode, band], places[mode, band])
-        places[mode, band, :length] += offsets[band]
+        for k in range(length):  # not a slice, which compiles for seconds
+            places[mode, band, k] += offsets[band]
         lengths[mode, band] = length
         total = 0.0
         for value in own:
