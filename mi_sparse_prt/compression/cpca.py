@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.threads import one_blas_thread
+from mi_sparse_prt.core.threads import one_blas_thread, run_in_parts
 
 ITERATIONS = 1  # of assigning and fitting, for each basis vector
 SETTLING = 4  # of them, at the beginning without basis vectors, and at the end with all
@@ -376,15 +376,19 @@ def reassign(rows: Floats, clusters: Clusters, candidates: Indices) -> Indices:
 
 def squared_distances(rows: Floats, clusters: Clusters, candidates: Indices) -> Floats:
     """Of each item to some clusters (n, any), summed over its rows."""
-    return _squared_distances(rows, clusters.means, clusters.bases, candidates)
+    squares = np.empty(candidates.shape, np.float32)
+    near = np.ascontiguousarray(candidates)  # one layout: compiled once
+    run_in_parts(_fill_squares, len(rows), rows, clusters.means, clusters.bases, near, squares)
+    return squares
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
-def _squared_distances(rows: Floats, means: Floats, bases: Floats, candidates: Indices) -> Floats:
-    """Of items (n, g, m) to some clusters (n, any), summed over rows."""
-    squares = np.zeros(candidates.shape, np.float32)
-    for i in numba.prange(len(rows)):
-        away = np.empty(rows.shape[2], np.float32)
+@numba.njit(nogil=True, fastmath=True, cache=True)
+def _fill_squares(
+    start: int, end: int, rows: Floats, means: Floats, bases: Floats, candidates: Indices, squares: Floats
+) -> None:
+    """Squared distances of items (n, g, m) to some clusters (n, any), summed over rows."""
+    away = np.empty(rows.shape[2], np.float32)
+    for i in range(start, end):
         for which in range(candidates.shape[1]):
             c, total = candidates[i, which], np.float32(0)
             for row in range(rows.shape[1]):
@@ -397,7 +401,6 @@ def _squared_distances(rows: Floats, means: Floats, bases: Floats, candidates: I
                         along += away[j] * bases[c, k, j]
                     total -= along * along
             squares[i, which] = total
-    return squares
 
 
 def _without_empty(rows: Floats, weights: Floats, clusters: Clusters, centred: bool) -> Clusters:

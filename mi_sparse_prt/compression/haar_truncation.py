@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.compression.clustered_pca import mesh_rows
 from mi_sparse_prt.core.metrics import relative_l2_by_name
 from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar
 from mi_sparse_prt.measurement.measurement import MeshRange
@@ -156,15 +157,17 @@ def truncate(coefficients: Floats, share: float) -> Doubles:
     """
     flat = coefficients.reshape(-1, coefficients.shape[-1])
     energies = np.empty((len(flat), 2))
-    _truncate(flat, flat.view(np.int32), share, energies)
+    run_in_parts(_truncate, len(flat), flat, flat.view(np.int32), share, energies)
     return energies.reshape(*coefficients.shape[:-1], 2)
 
 
-@numba.njit(parallel=True, cache=True)
-def _truncate(rows: Floats, bits: NDArray[np.int32], share: float, energies: Doubles) -> None:
+@numba.njit(nogil=True, cache=True)
+def _truncate(
+    start: int, end: int, rows: Floats, bits: NDArray[np.int32], share: float, energies: Doubles
+) -> None:
     """Find the least magnitude that is kept digit by digit, from sums of squares for each digit: no row is sorted."""
-    n, m = rows.shape
-    for i in numba.prange(n):
+    m = rows.shape[1]
+    for i in range(start, end):
         total = 0.0
         for j in range(m):
             total += np.float64(rows[i, j]) ** 2

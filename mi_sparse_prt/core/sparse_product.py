@@ -7,6 +7,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.threads import run_in_parts
+
 Floats = NDArray[np.float32]
 
 
@@ -41,14 +43,16 @@ def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Float
     bounds[0], bounds[-1] = 0, matrix.shape[0]
     result = np.empty((len(albedo), matrix.shape[0], light.shape[1]), np.float32)
     for a in range(0, light.shape[1], slab):
-        part = slice(a, a + slab)
-        some = np.ascontiguousarray(light[:, part], np.float32)
-        _multiply(bounds, matrix.indptr, matrix.indices, matrix.data, albedo, some, result[:, :, part])
+        some = np.ascontiguousarray(light[:, a : a + slab], np.float32)
+        arrays = bounds, matrix.indptr, matrix.indices, matrix.data, albedo, some, result
+        run_in_parts(_multiply, len(shares) - 1, *arrays, a)
     return result
 
 
-@numba.njit(parallel=True, fastmath={"contract"}, cache=True)
+@numba.njit(nogil=True, fastmath={"contract"}, cache=True)
 def _multiply(
+    first: int,
+    last: int,
     bounds: NDArray[np.int64],
     starts: NDArray[np.int32],
     columns: NDArray[np.int32],
@@ -56,11 +60,15 @@ def _multiply(
     albedo: Floats,
     light: Floats,
     result: Floats,
+    column: int,
 ) -> None:
-    """Rows bounds[t] to bounds[t + 1] by thread t; four entries at a time, so that sums are stored less often."""
+    """Rows bounds[t] to bounds[t + 1] as the t-th part; four entries at a time, so that sums are stored less often.
+
+    Into columns of the result from ``column`` on, which is whole: slices are contiguous or not, and compiled twice.
+    """
     width = light.shape[1]
-    for t in numba.prange(len(bounds) - 1):
-        total = np.empty((len(albedo), width), np.float32)
+    total = np.empty((len(albedo), width), np.float32)
+    for t in range(first, last):
         for i in range(bounds[t], bounds[t + 1]):
             total[:] = 0
             end = starts[i + 1]
@@ -82,4 +90,4 @@ def _multiply(
                 e += 1
             for h in range(len(albedo)):  # not a slice: its error message alone compiles for seconds
                 for k in range(width):
-                    result[h, i, k] = total[h, k]
+                    result[h, i, column + k] = total[h, k]

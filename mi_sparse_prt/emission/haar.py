@@ -104,7 +104,8 @@ def _transform(values: NDArray[np.float32], scale: NDArray[np.float32], faces: N
                         # what is overwritten is not needed any more: i and j are never above 2 i and 2 j
                         own[i, j, c] = half_of * ((a + b) + (d + e))
             size = half
-        faces[f, 0, 0] = own[0, 0]
+        for c in range(3):  # not a slice: its error message alone compiles for seconds
+            faces[f, 0, 0, c] = own[0, 0, c]
 
 
 def _faces(values: Floats) -> Floats:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import Bits, bit_of
 from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
 from mi_sparse_prt.core.read_only import read_only
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.transport import LightTransport
@@ -187,29 +188,33 @@ def _by_cosine(
     seeds = rng.integers(1 << 63, size=n, dtype=np.uint64)
     for a in range(0, n, BLOCK):
         block = slice(a, min(a + BLOCK, n))
-        texels, weights, counts = _kept(
-            normals[block], directions, areas, floor, read_only(bits[block]), around, trials, seeds[block]
-        )
+        size = block.stop - a, trials
+        texels, weights, counts = np.empty(size, np.int32), np.empty(size), np.zeros(size[0], np.int64)
+        among = normals[block], directions, areas, floor, read_only(bits[block]), around, seeds[block]
+        run_in_parts(_keep, size[0], *among, texels, weights, counts)
         vertices = np.repeat(np.arange(first + a, first + block.stop), counts)
         parts.append((vertices, *_packed(texels, weights, counts)))
     return Chosen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-@numba.njit(parallel=True, cache=True)
-def _kept(
+@numba.njit(nogil=True, cache=True)
+def _keep(
+    start: int,
+    end: int,
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
     areas: NDArray[np.float32],
     floor: float,
     bits: Bits,
     around: NDArray[np.int32],
-    trials: int,
     seeds: NDArray[np.uint64],
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    texels: NDArray[np.int32],
+    weights: NDArray[np.float64],
+    counts: NDArray[np.int64],
+) -> None:
     """Texels and weights of the trials of each vertex that are kept, (n, trials), and how many these are, (n,)."""
-    texels, weights = np.empty((len(normals), trials), np.int32), np.empty((len(normals), trials))
-    counts = np.zeros(len(normals), np.int64)
-    for i in numba.prange(len(normals)):
+    trials = texels.shape[1]
+    for i in range(start, end):
         state = seeds[i]
         for _ in range(trials):
             state += np.uint64(GOLDEN_RATIO)
@@ -229,7 +234,6 @@ def _kept(
             texels[i, counts[i]] = texel
             weights[i, counts[i]] = len(directions) / (trials * probability)
             counts[i] += 1
-    return texels, weights, counts
 
 
 @numba.njit(cache=True)

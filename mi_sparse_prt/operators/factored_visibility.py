@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, bit_of
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
@@ -107,7 +108,9 @@ class FactoredVisibility(Operator):
         asked = texels[~diffuse].astype(np.int64)
         directions, power = self.lighting.directions[asked], self.lighting.solid_angles[asked]
         places = asked, directions, power.astype(np.float32), term
-        result[~diffuse, 0] = _single(self.visibility.seen, self._points(which), *places)
+        found = np.empty(len(which), np.float32)
+        run_in_parts(_single, len(which), self.visibility.seen, self._points(which), *places, found)
+        result[~diffuse, 0] = found
         return result
 
     def dense_columns(self, texels: Ids, out: Floats) -> Floats:
@@ -126,7 +129,8 @@ class FactoredVisibility(Operator):
     def relight(self, lighting: Floats) -> Floats:
         directions = np.ascontiguousarray(self.lighting.directions.T)
         power = (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
-        terms = _relit(self.visibility.seen, self._points(), directions, power, self.terms)
+        terms = np.empty((len(self.glossy), self.terms, 3), np.float32)
+        run_in_parts(_relit, len(terms), self.visibility.seen, self._points(), directions, power, terms)
         return np.concatenate([self.visibility.relight(lighting), terms.reshape(-1, 3)])
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
@@ -136,7 +140,8 @@ class FactoredVisibility(Operator):
         place = np.full(-(-self.lighting.n_directions // signs.shape[1]), -1)
         place[words] = np.arange(len(words))
         chosen = np.asarray(words, np.int64), place, directions, power
-        found = _combined(self.visibility.seen, self._points(), *chosen, self.terms)
+        found = np.empty((len(self.glossy), self.terms, signs.shape[1]), np.float32)
+        run_in_parts(_combined, len(found), self.visibility.seen, self._points(), *chosen, found)
         return np.concatenate([self.visibility.combined(words, signs), found.reshape(-1, signs.shape[1])])
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> FactoredVisibility:
@@ -189,7 +194,10 @@ class FactoredVisibility(Operator):
         directions = np.ascontiguousarray(self.lighting.directions[texels].T)
         power = self.lighting.solid_angles[texels].astype(np.float32)
         asked = np.asarray(texels, np.int64)
-        return _expanded(self.visibility.seen, self._points(which), asked, directions, power, self.terms)
+        points = self._points(which)
+        result = np.empty((len(points[0]), self.terms, len(asked)), np.float32)
+        run_in_parts(_expanded, len(result), self.visibility.seen, points, asked, directions, power, result)
+        return result
 
 
 @dataclass(frozen=True)
@@ -256,20 +264,21 @@ def _add(
             )
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _expanded(
+    start: int,
+    end: int,
     seen: SeenTexels,
     points: GlossyPoints,
     texels: NDArray[np.int64],
     directions: Floats,
     power: Floats,
-    terms: int,
-) -> Floats:
+    result: Floats,
+) -> None:
     """Terms (n, terms, m) at texels (m,), whose directions are (3, m)."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
-    result = np.zeros((len(vertices), terms, len(texels)), np.float32)
-    for i in numba.prange(len(vertices)):
-        value = np.empty((1, tables.shape[3]), np.float32)
+    value, terms = np.empty((1, tables.shape[3]), np.float32), result.shape[1]
+    for i in range(start, end):
         first, last = starts[vertices[i]], starts[vertices[i] + 1]
         own = listed[first:last]
         for j in range(len(texels)):
@@ -279,56 +288,62 @@ def _expanded(
                 if e < len(own) and own[e] == texels[j]:
                     weight = power[j] * (np.float32(shares[first + e]) / np.float32(FULL))
             if weight == 0:
+                for k in range(terms):
+                    result[i, k, j] = 0
                 continue
             u, v, w = directions[0, j], directions[1, j], directions[2, j]
             value[:] = 0
             _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
             for k in range(terms):
                 result[i, k, j] = value[0, k]
-    return result
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _single(
+    start: int,
+    end: int,
     seen: SeenTexels,
     points: GlossyPoints,
     texels: NDArray[np.int64],
     directions: Floats,
     power: Floats,
     term: NDArray[np.int64],
-) -> Floats:
+    result: Floats,
+) -> None:
     """One term (m,) at one texel each, whose directions are (m, 3)."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
-    result = np.zeros(len(vertices), np.float32)
-    for i in numba.prange(len(vertices)):
+    value = np.empty((1, tables.shape[3]), np.float32)
+    for i in range(start, end):
         weight = power[i] * np.float32(bit_of(bits[vertices[i]], texels[i]))
         first, last = starts[vertices[i]], starts[vertices[i] + 1]
         e = first + np.searchsorted(listed[first:last], texels[i])
         if e < last and listed[e] == texels[i]:
             weight = power[i] * (np.float32(shares[e]) / np.float32(FULL))
+        result[i] = 0
         if weight == 0:
             continue
-        value = np.zeros((1, tables.shape[3]), np.float32)
-        u, v, w = directions[i]
+        value[:] = 0
+        u, v, w = directions[i, 0], directions[i, 1], directions[i, 2]
         _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
         result[i] = value[0, term[i]]
-    return result
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _relit(
+    start: int,
+    end: int,
     seen: SeenTexels,
     points: GlossyPoints,
     directions: Floats,
     power: Floats,
-    terms: int,
-) -> Floats:
+    result: Floats,
+) -> None:
     """Coefficients (n, terms, 3) under lights power (n_directions, 3), solid angles included."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
-    result = np.empty((len(vertices), terms, 3), np.float32)
-    for i in numba.prange(len(vertices)):
-        total = np.zeros((3, tables.shape[3]), np.float32)
-        value = np.empty((1, tables.shape[3]), np.float32)
+    total = np.empty((3, tables.shape[3]), np.float32)
+    value = np.empty((1, tables.shape[3]), np.float32)
+    for i in range(start, end):
+        total[:] = 0
         for j in range(directions.shape[1]):
             if (bits[vertices[i], j // 32] >> np.uint32(j % 32)) & np.uint32(1) == 0:
                 continue
@@ -347,31 +362,32 @@ def _relit(
             for c in range(3):
                 for k in range(tables.shape[3]):
                     total[c, k] += value[0, k] * power[j, c]
-        for k in range(terms):  # not a slice: its error message alone compiles for seconds
+        for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
                 result[i, k, c] = total[c, k]
-    return result
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _combined(
+    start: int,
+    end: int,
     seen: SeenTexels,
     points: GlossyPoints,
     words: NDArray[np.int64],
     place: NDArray[np.int64],
     directions: Floats,
     power: Floats,
-    terms: int,
-) -> Floats:
+    result: Floats,
+) -> None:
     """Sums (n, terms, b) over words of the terms at their bits; directions (words, 3, b), power (words, b).
 
     ``place`` says where among ``words`` a word is, or -1.
     """
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     width = power.shape[1]
-    result = np.empty((len(vertices), terms, width), np.float32)
-    for i in numba.prange(len(vertices)):
-        total = np.zeros((width, tables.shape[3]), np.float32)
+    total = np.empty((width, tables.shape[3]), np.float32)
+    for i in range(start, end):
+        total[:] = 0
         for g in range(len(words)):
             mask = bits[vertices[i], words[g]]
             if mask == 0:
@@ -389,7 +405,6 @@ def _combined(
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
             _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b] * more)
-        for k in range(terms):  # not a slice: its error message alone compiles for seconds
+        for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
                 result[i, k, c] = total[c, k]
-    return result

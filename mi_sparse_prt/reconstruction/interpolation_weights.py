@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.neighbours import Neighbours
 
 
@@ -34,26 +35,32 @@ def linear_weights(
     (n, k) float32
         0 where there is no neighbour.
     """
-    return _linear_weights(
+    weights = np.zeros(neighbours.ids.shape, np.float32)
+    run_in_parts(
+        _weigh_all,
+        len(weights),
         np.ascontiguousarray(neighbours.ids),  # one layout: compiled once
         np.ascontiguousarray(neighbours.distances),
         np.hstack([positions, normals]),
         np.hstack([dense_positions, dense_normals]),
+        weights,
     )
+    return weights
 
 
-@numba.njit(parallel=True, cache=True)
-def _linear_weights(
+@numba.njit(nogil=True, cache=True)
+def _weigh_all(
+    start: int,
+    end: int,
     ids: NDArray[np.int32],
     distances: NDArray[np.float32],
     points: NDArray[np.floating],
     dense: NDArray[np.floating],
-) -> NDArray[np.float32]:
+    weights: NDArray[np.float32],
+) -> None:
     """Of points (n, 6) and dense vertices (m, 6), each a position and a normal."""
-    weights = np.zeros(ids.shape, np.float32)
-    for i in numba.prange(len(ids)):
+    for i in range(start, end):
         _weigh(ids[i], distances[i], points[i], dense, weights[i])
-    return weights
 
 
 @numba.njit(cache=True)
@@ -64,7 +71,7 @@ def _weigh(
     dense: NDArray[np.floating],
     weights: NDArray[np.float32],
 ) -> None:
-    """The weights of one point; apart from the parallel loop, in which it would take thrice as long to compile."""
+    """The weights of one point."""
     gaussians = 1.5  # standard deviations (times sqrt 2) at which the farthest neighbour is
     normal_unit = 2.0  # slopes in normals count from differences of half a unit on
     ridge = 0.3  # of slopes, in squared steps between dense vertices

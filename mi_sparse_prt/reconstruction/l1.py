@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.threads import run_in_parts
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +90,11 @@ def l1_fit(
     check_option("relative_lambda", relative_lambda, relative_lambda >= 0, "0 or more")
     check_option("tolerance", tolerance, tolerance > 0, "more than 0")
     check_option("most_steps", most_steps, most_steps > 0, "1 or more")
-    return Fit(*_descend_all(*products, float(relative_lambda), float(tolerance), int(most_steps)))
+    m, k = products[1].shape
+    fit = Fit(np.zeros((m, k)), np.empty(m), np.empty(m), np.empty(m, np.int64))
+    options = float(relative_lambda), float(tolerance), int(most_steps)
+    run_in_parts(_descend_all, m, *products, *options, fit.weights, fit.objective, fit.gap, fit.iterations)
+    return fit
 
 
 def check_option(name: str, value: float, valid: bool, wanted: str) -> None:
@@ -177,8 +182,10 @@ def objective_and_gap(b: Floats, c: Floats, q: Floats, half: Floats) -> tuple[fl
 # -- coordinate descent -----------------------------------------------------------------------------------------------
 
 
-@numba.njit(parallel=True, cache=True)  # no fastmath: sums keep their order, on any number of threads
+@numba.njit(nogil=True, cache=True)  # no fastmath: sums keep their order, on any number of threads
 def _descend_all(
+    start: int,
+    end: int,
     G: NDArray,
     r: Floats,
     s: Floats,
@@ -186,18 +193,18 @@ def _descend_all(
     relative_lambda: float,
     tolerance: float,
     most_steps: int,
-) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
-    m, k = r.shape
-    weights, objective, gap = np.zeros((m, k)), np.zeros(m), np.zeros(m)
-    iterations = np.zeros(m, dtype=np.int64)
-    for p in numba.prange(m):
+    weights: Floats,
+    objective: Floats,
+    gap: Floats,
+    iterations: NDArray[np.int64],
+) -> None:
+    for p in range(start, end):
         used, g, c, half, unit = normalise(G[p], r[p], s[p], eps, relative_lambda)
         b = np.zeros(len(used))
         least, above, iterations[p] = _descend(g, c, half, b, relative_lambda > 0, tolerance, most_steps)
         objective[p], gap[p] = least * s[p], above * s[p]
         for a in range(len(used)):
             weights[p, used[a]] = b[a] * unit[a]
-    return weights, objective, gap, iterations
 
 
 @numba.njit(cache=True)

@@ -6,8 +6,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.threads import run_in_parts
 
-@numba.njit(parallel=True, cache=True)
+
 def normal_equations(
     rows: NDArray[np.float32],
     neighbours: NDArray[np.int32],
@@ -37,12 +38,27 @@ def normal_equations(
     gram = np.zeros((n, k, k))
     correlation = np.zeros((n, k))
     squared_norm = np.zeros(n)
-    for i in numba.prange(n):
+    run_in_parts(_multiply_all, n, rows, neighbours, directions, values, gram, correlation, squared_norm)
+    return gram, correlation, squared_norm
+
+
+@numba.njit(nogil=True, cache=True)
+def _multiply_all(
+    start: int,
+    end: int,
+    rows: NDArray[np.float32],
+    neighbours: NDArray[np.int32],
+    directions: NDArray[np.int32],
+    values: NDArray[np.float32],
+    gram: NDArray[np.float64],
+    correlation: NDArray[np.float64],
+    squared_norm: NDArray[np.float64],
+) -> None:
+    for i in range(start, end):
         system, y = _gather(rows, neighbours[i], directions[i], values[i])
         np.dot(system.T, system, gram[i])  # not into a slice: its error message alone compiles for seconds
         np.dot(system.T, y, correlation[i])
         squared_norm[i] = y @ y
-    return gram, correlation, squared_norm
 
 
 @numba.njit(cache=True)

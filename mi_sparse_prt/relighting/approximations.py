@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.heap import keep_largest
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.haar import haar_bands
 
 Floats = NDArray[np.float32]
@@ -301,7 +302,6 @@ def _largest(sizes: Floats, count: int) -> Ints:
     return places[: keep_largest(sizes, count, room, places)]
 
 
-@numba.njit(parallel=True, cache=True)
 def _largest_of_bands(
     values: Floats, offsets: Ints, count: int, power: int
 ) -> tuple[Floats, Ints, Ints, NDArray[np.float64]]:
@@ -309,18 +309,35 @@ def _largest_of_bands(
     bands = len(offsets) - 1
     sizes, places = np.zeros((2, bands, count), np.float32), np.zeros((2, bands, count), np.int64)
     lengths, totals = np.zeros((2, bands), np.int64), np.zeros((2, bands))
-    for which in numba.prange(2 * bands):
-        # a thread has all bands of a mode: the finest is most of the work
-        mode, band = which // bands, which % bands
-        own = values[mode, offsets[band] : offsets[band + 1]]
-        length = keep_largest(own, count, sizes[mode, band], places[mode, band])
-        places[mode, band, :length] += offsets[band]
-        lengths[mode, band] = length
-        total = 0.0
-        for value in own:
-            total += value if power == 1 else value * value
-        totals[mode, band] = total
+    # a thread has all bands of a mode: the finest is most of the work
+    run_in_parts(_find_largest, 2, values, offsets, count, power, sizes, places, lengths, totals)
     return sizes, places, lengths, totals
+
+
+@numba.njit(nogil=True, cache=True)
+def _find_largest(
+    first: int,
+    last: int,
+    values: Floats,
+    offsets: Ints,
+    count: int,
+    power: int,
+    sizes: Floats,
+    places: Ints,
+    lengths: Ints,
+    totals: NDArray[np.float64],
+) -> None:
+    for mode in range(first, last):
+        for band in range(len(offsets) - 1):
+            own = values[mode, offsets[band] : offsets[band + 1]]
+            length = keep_largest(own, count, sizes[mode, band], places[mode, band])
+            for k in range(length):  # not a slice, which compiles for seconds
+                places[mode, band, k] += offsets[band]
+            lengths[mode, band] = length
+            total = 0.0
+            for value in own:
+                total += value if power == 1 else value * value
+            totals[mode, band] = total
 
 
 @numba.njit(cache=True)

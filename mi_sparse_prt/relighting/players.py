@@ -257,7 +257,8 @@ def _add_to_clusters(
                     change, column = np.float64(changes[k, colour]), columns[coefficients[k], first:last]
                     for q in range(len(own)):
                         own[q] += change * column[q]
-                total[colour, first:last] += own
+                for q in range(len(own)):  # loops here and below: slices of slices compile for seconds
+                    total[colour, first + q] += own[q]
     return total
 
 
@@ -318,8 +319,11 @@ def _add_to_rows(
         first, last, base = starts[c], starts[c + 1], c * (b + 1)
         anew = c % REFRESH == turn
         if anew:
-            done[:, base : base + b + 1] = 0
-            rows[:, first:last] = 0
+            for colour in range(3):
+                for q in range(base, base + b + 1):
+                    done[colour, q] = 0
+                for i in range(first, last):
+                    rows[colour, i] = 0
         for colour in range(3):
             change = np.float32(now[colour, base] - done[colour, base])
             done[colour, base] = now[colour, base]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import count_ones
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.neighbours import check_finite_rows, radius_neighbours
 
 
@@ -260,18 +261,25 @@ def local_rank(
     odd = bits.shape[1] % 2
     words = np.ascontiguousarray(np.pad(bits, ((0, 0), (0, odd))) if odd else bits, np.uint32)
     rounding = 1e-9  # 99 of 100 equal singular values hold 0.99, whatever their last bits
-    return _ranks(words.view(np.uint64), ids, energy - rounding)
-
-
-@numba.njit(parallel=True, cache=True)
-def _ranks(words: NDArray[np.uint64], ids: NDArray[np.int64], energy: float) -> NDArray[np.int64]:
-    """Ranks (m,) of the matrices with rows `ids` (m, k) of `words` (n_dense, w), one matrix per thread at a time."""
     ranks = np.zeros(len(ids), np.int64)
-    for v in numba.prange(len(ids)):
+    run_in_parts(_rank_all, len(ids), words.view(np.uint64), ids, energy - rounding, ranks)
+    return ranks
+
+
+@numba.njit(nogil=True, cache=True)
+def _rank_all(
+    start: int,
+    end: int,
+    words: NDArray[np.uint64],
+    ids: NDArray[np.int64],
+    energy: float,
+    ranks: NDArray[np.int64],
+) -> None:
+    """Ranks (m,) of the matrices with rows `ids` (m, k) of `words` (n_dense, w)."""
+    for v in range(start, end):
         rows = ids[v][ids[v] >= 0]
         if len(rows):
             ranks[v] = _count_largest(np.linalg.eigvalsh(_gram(words, rows)), energy)
-    return ranks
 
 
 @numba.njit(cache=True)

@@ -188,7 +188,8 @@ def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | No
     if n <= count:
         return None
     signs = 1 - 2 * (hashes >> np.uint64(63)).astype(np.float32)
-    entries = signs, ((hashes & np.uint64(count - 1)).astype(np.int64), np.arange(n))
+    # 32 bits, as other matrices have them: the product is compiled once
+    entries = signs, ((hashes & np.uint64(count - 1)).astype(np.int32), np.arange(n, dtype=np.int32))
     return scipy.sparse.csr_array(entries, shape=(count, n))
 
 

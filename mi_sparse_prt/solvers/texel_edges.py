@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, count_bits, list_bits, lowest_bit
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.read_only import read_only
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.texel_adjacency import Sides, TexelSides
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -118,9 +119,8 @@ def _cut_texels(
     room = row_starts(np.minimum(AROUND * np.diff(crossings.starts) + count_bits(horizon), m))
     seen, entries = bits.copy(), np.empty(room[-1], np.uint32)
     number = np.empty(len(bits), np.int64)
-    threads = numba.get_num_threads()
-    known = read_only(bits)
-    _find_shares(sides.tables, known, above, horizon, crossings, threads, room, seen, entries, number)
+    found = room, seen, entries, number
+    run_in_parts(_find_shares, len(bits), sides.tables, read_only(bits), above, horizon, crossings, *found)
     starts = row_starts(number)
     kind = np.result_type(
         np.uint16, np.min_scalar_type(m - 1)
@@ -130,14 +130,15 @@ def _cut_texels(
     return seen, number, texels, shares
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _find_shares(
+    start: int,
+    end: int,
     sides: Sides,
     bits: Bits,
     above: Bits,
     horizon: Bits,
     crossings: Crossings,
-    threads: int,
     room: NDArray[np.int64],
     seen: Bits,
     entries: NDArray[np.uint32],
@@ -147,36 +148,35 @@ def _find_shares(
 
     Texels that the horizon may cut, their centres below it, are seen as those around them are; ``seen`` says so.
     """
-    for thread in numba.prange(threads):
-        # where visibility changes between the texels of each pair, and for which vertex each texel was cut last
-        edge = np.full(len(sides.first), -1.0, np.float32)
-        done = np.full(len(sides.beside), -1, np.int64)
-        for i in range(thread, len(bits), threads):
-            at, own = room[i], range(crossings.starts[i], crossings.starts[i + 1])
-            for e in own:
-                edge[crossings.pairs[e]] = crossings.places[e]
-            for e in own:
-                for texel in sides.around[crossings.pairs[e]]:
-                    if texel >= 0 and done[texel] != i and bit_of(above[i], texel):
-                        done[texel] = i
-                        area = _area(sides, bits[i], above[i], edge, texel)
-                        at = _listed(texel, area, bit_of(bits[i], texel), entries, at)
-            for w in range(horizon.shape[1]):
-                left = horizon[i, w]
-                while left:
-                    pair = w * BITS + np.int64(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
-                    left &= left - np.uint32(1)
-                    texel = sides.second[pair] if bit_of(above[i], sides.first[pair]) else sides.first[pair]
-                    if done[texel] != i:
-                        done[texel] = i
-                        share = _mean_around(sides, bits[i], above[i], texel)
-                        whole = np.uint32(share > 0.5)
-                        seen[i, texel // BITS] |= whole << np.uint32(texel % BITS)
-                        at = _listed(texel, share, whole, entries, at)
-            entries[room[i] : at].sort()
-            number[i] = at - room[i]
-            for e in own:
-                edge[crossings.pairs[e]] = -1.0
+    # where visibility changes between the texels of each pair, and for which vertex each texel was cut last
+    edge = np.full(len(sides.first), -1.0, np.float32)
+    done = np.full(len(sides.beside), -1, np.int64)
+    for i in range(start, end):
+        at, own = room[i], range(crossings.starts[i], crossings.starts[i + 1])
+        for e in own:
+            edge[crossings.pairs[e]] = crossings.places[e]
+        for e in own:
+            for texel in sides.around[crossings.pairs[e]]:
+                if texel >= 0 and done[texel] != i and bit_of(above[i], texel):
+                    done[texel] = i
+                    area = _area(sides, bits[i], above[i], edge, texel)
+                    at = _listed(texel, area, bit_of(bits[i], texel), entries, at)
+        for w in range(horizon.shape[1]):
+            left = horizon[i, w]
+            while left:
+                pair = w * BITS + np.int64(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
+                left &= left - np.uint32(1)
+                texel = sides.second[pair] if bit_of(above[i], sides.first[pair]) else sides.first[pair]
+                if done[texel] != i:
+                    done[texel] = i
+                    share = _mean_around(sides, bits[i], above[i], texel)
+                    whole = np.uint32(share > 0.5)
+                    seen[i, texel // BITS] |= whole << np.uint32(texel % BITS)
+                    at = _listed(texel, share, whole, entries, at)
+        entries[room[i] : at].sort()
+        number[i] = at - room[i]
+        for e in own:
+            edge[crossings.pairs[e]] = -1.0
 
 
 @numba.njit
