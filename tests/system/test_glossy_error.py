@@ -24,6 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 LIGHTING = prt.CubemapLighting(4)
 TERMS, SEEDS = 2, range(32)
 EFFORT = Effort(spp=64)  # their noise is taken out, whatever it is
+LESS_EFFORT = Effort(spp=24)  # where what is judged has errors of more than 5%
 Doubles = NDArray[np.float64]
 
 
@@ -153,11 +154,11 @@ def test_the_error_of_brute_force(coloured):
 
     Expected: its estimate is its error, as for finite elements; with 16 times the paths a quarter of it.
     """
-    few, truth = precompute(method="brute_force", spp=8, seed=5), converged(True)
+    few, truth = precompute(method="brute_force", spp=4, seed=5), converged(True)
     true = true_errors(few, rows_of(few), *map(rows_of, truth))
     problem = problem_of(scene_of(True), few, 5)
-    check([held_out_error(problem, few, seed, effort=EFFORT).report() for seed in SEEDS], true)
-    more = precompute(method="brute_force", spp=128, seed=5)
+    check([held_out_error(problem, few, seed, effort=LESS_EFFORT).report() for seed in SEEDS], true)
+    more = precompute(method="brute_force", spp=64, seed=5)
     assert more.report["estimated_error"]["total"] == pytest.approx(true["total"] / 4, rel=0.25)
 
 
@@ -179,7 +180,7 @@ def test_texels(max_depth):
     if max_depth > 2:
         truth = [rows + indirect_by_paths(problem, seed) for rows, seed in zip(truth, (60, 61), strict=True)]
     true = true_errors(transport, rows_of(transport), *truth)
-    check([held_out_error(problem, transport, seed, effort=EFFORT).report() for seed in SEEDS], true)
+    check([held_out_error(problem, transport, seed, effort=LESS_EFFORT).report() for seed in SEEDS], true)
 
 
 def direct_by_rays(problem: Problem, seed: int) -> Doubles:
@@ -192,7 +193,7 @@ def direct_by_rays(problem: Problem, seed: int) -> Doubles:
 
 
 def indirect_by_paths(problem: Problem, seed: int) -> Doubles:
-    found = TermPaths(problem, 128, seed).rows(np.arange(len(problem.points))).mean
+    found = TermPaths(problem, 48, seed).rows(np.arange(len(problem.points))).mean
     by_row = found.reshape(*found.shape[:2], 1 + TERMS, -1)  # [point, texel, row, channel]
     return rows_in_order(problem, by_row * LIGHTING.solid_angles[:, None, None])
 
@@ -346,6 +347,7 @@ def test_what_terms_do_not_go_with(parameters: dict, said: str):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_same_seed_same_matrix():
     first, again, other = (precompute(method="gather", basis="texel", seed=seed) for seed in (0, 0, 1))
     assert np.array_equal(first.rows([1, 300]), again.rows([1, 300]))
