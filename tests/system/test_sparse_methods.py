@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import COLOURS, GREY, T, build, diffuse, made_up, mesh, still_life
+from conftest import COLOURS, GREY, T, build, diffuse, made_up, mesh, still_life, without_held_out
 from numpy.typing import NDArray
 
 import mi_sparse_prt as prt
@@ -63,7 +63,8 @@ def scene() -> prt.Scene:
 
 @cache
 def brute_force() -> LightTransport:
-    return precompute(scene(), "brute_force")
+    with without_held_out():
+        return precompute(scene(), "brute_force")
 
 
 @cache
@@ -181,6 +182,7 @@ def test_no_light_is_won_or_lost(method):
     assert np.mean(gains) == pytest.approx(mean, abs=3 * deviation * np.sqrt(1 / 4 + 1 / 8))
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_rates_of_huang2010_are_those_of_figure_9():
     """At the paper's resolution, 6 x 32 x 32, on 3369 vertices.
 
@@ -207,7 +209,8 @@ def test_rates_of_huang2010_are_those_of_figure_9():
 
 @cache
 def full() -> LightTransport:
-    return precompute(scene(), "brute_force", 4)
+    with without_held_out():
+        return precompute(scene(), "brute_force", 4)
 
 
 def test_sparse_is_better_for_less():
@@ -222,7 +225,8 @@ def test_indirect_light_of_sparse():
     Expected: the mean per vertex within 15%, which is what interpolation costs; the sum within the 2% that 4 x 4 texels
     per face may miss of it, and three standard errors of these seeds, which are small enough to see 5%.
     """
-    true = precompute(scene(), "brute_force", 4, spp=24).indirect
+    with without_held_out():
+        true = precompute(scene(), "brute_force", 4, spp=24).indirect
     even = np.ones((N, 3), np.float32)
     expected, found = true.relight(even), []
     for seed in range(4):
@@ -318,6 +322,7 @@ def shuffled(source: prt.Scene, seed: int) -> prt.Scene:
     return build(float("inf"), **shapes)
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("method", METHODS)
 def test_order_of_shapes_and_vertices(method):
     """Rationale: the choice of vertices, their neighbours and pools are made of places and keys, not of numbers.
@@ -334,6 +339,7 @@ def test_order_of_shapes_and_vertices(method):
         assert relative(b.rows(ids), a.rows(ids)) < (1e-7 if max_depth == 2 else 1e-5)
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_merged_scene_gets_the_same_rows(method):
     """One material, shapes merged by Mitsuba: the matrix of the separate scene serves it, in its order."""
@@ -371,6 +377,7 @@ def test_place_and_scale(method, scale, offset):
 # ------------------------------------------------------------------------------------ special scenes
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("method", METHODS)
 def test_no_bounces_off_black(method, monkeypatch):
     counter = Counter(monkeypatch, scene().n_vertices)
@@ -409,6 +416,7 @@ def test_an_unknown_method_names_those_there_are():
         precompute(scene(), "dense")
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_meshes_whose_vertices_are_all_dense() -> None:
     """A scene so coarse that some meshes have nothing but dense vertices.
 
@@ -423,6 +431,7 @@ def test_meshes_whose_vertices_are_all_dense() -> None:
     assert np.isfinite(transport.rows(np.arange(len(scene.positions)))).all()
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_no_rows_are_asked_for(grey_scene: prt.Scene) -> None:
     """``rows`` of an empty list of an interpolated matrix is empty, as that of any other."""
     transport = prt.precompute(
@@ -456,6 +465,7 @@ def test_whole_rows_of_huang2010_take_little_more_memory_than_they_are():
     np.testing.assert_allclose(grey, factors.direct.rows(ids)[..., 0], rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("method", METHODS)
 def test_interrupted_and_gone_on_with(method, tmp_path, monkeypatch):
     """Ctrl-C in the middle of the dense rows. The next run traces the others only, and its matrix is the same."""
