@@ -44,6 +44,7 @@ def surface(rings: list[np.ndarray], inwards: bool) -> tuple[np.ndarray, np.ndar
 # ------------------------------------------------------------------------------------ convex and closed
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("kind", ["sphere", "cube", "ellipsoid"])
 def test_a_convex_object_alone(kind, artefact):
     """Rationale: under constant light a convex object has B = albedo everywhere: it sees the whole hemisphere.
@@ -218,6 +219,7 @@ def test_known_form_factors(kind, artefact):
     artefact(figure)
 
 
+@pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize("angle", [20, 45, 70])
 def test_a_cap_of_light_over_a_plane(angle, artefact):
     """Rationale: a plane under a cap of radiance 1 and half-angle a about its normal has irradiance pi sin²a.

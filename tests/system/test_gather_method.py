@@ -25,6 +25,7 @@ def gathered(scene: prt.Scene) -> prt.LightTransport:
     return prt.precompute(scene, LIGHTING, method="gather", progress=False)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_direct_light_is_that_of_brute_force(scene, gathered):
     exact = prt.precompute(scene, LIGHTING, method="brute_force", max_depth=2, progress=False)
     assert np.array_equal(gathered.direct.bits, exact.direct.bits)
@@ -111,6 +112,7 @@ def test_a_target_error_is_met_by_more_rays():
     assert tight["elements_evaluated"] == loose["elements_evaluated"]
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_without_interreflections_it_is_direct_light(scene):
     for transport in (
         prt.precompute(scene, LIGHTING, method="gather", max_depth=2, progress=False),
@@ -137,6 +139,7 @@ def test_other_materials_count_as_diffuse_and_the_error_is_told():
     assert abs(told["total"] - true) < 4 * told["standard_error"]["total"] + 0.1 * true
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_same_seed_same_matrix(scene, gathered):
     again = prt.precompute(scene, LIGHTING, method="gather", progress=False)
     assert np.array_equal(again.rows([1, 50]), gathered.rows([1, 50]))
