@@ -5,7 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse, problem_at
+from conftest import PIPELINE, T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
@@ -17,8 +17,9 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
+from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
-from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.specular import SpecularLight, SpecularOptions, specular_light
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
@@ -115,14 +116,15 @@ def test_gathered_light_is_that_of_paths():
 
 
 @pytest.mark.parametrize(
-    ("glass", "spp"), [({"type": "dielectric"}, 6144), ({"type": "roughdielectric", "alpha": 0.2}, 57344)]
+    ("glass", "spp"), [({"type": "dielectric"}, 6144), ({"type": "roughdielectric", "alpha": 0.4}, 18432)]
 )
 def test_specular_light_is_what_paths_find_beside_the_rest(glass, spp):
     """Expected: the part by way of mirrors and glass alone is what all paths find less those scattered on the way.
 
     Total light of the six texels over the floor, two independent estimates each: within 3 standard errors, of which one
     is at most 0.65%, so that a specular part that is 2% off fails. All of that error is of paths; what these find by
-    mirrors alone has the most noise, so that the rest needs few of them.
+    mirrors alone has the most noise, so that the rest needs few of them. Glass as rough as this spreads light enough
+    that few paths find much of it.
     """
     shapes: dict = {
         "floor": {**FLOOR, "to_world": T().rotate([1, 0, 0], -90), "bsdf": diffuse(0.6, 0.6, 0.6)},
@@ -147,9 +149,9 @@ def test_specular_light_is_what_paths_find_beside_the_rest(glass, spp):
             .sum(axis=(0, 1))
             .mean()
         )
-        for seed in range(8)
+        for seed in range(4)
     ]
-    ours, error = float(np.mean(halves)), np.sqrt(v + w + np.var(halves, ddof=1) / 8)
+    ours, error = float(np.mean(halves)), np.sqrt(v + w + np.var(halves, ddof=1) / 4)
     print(f"{glass['type']}: {ours:.3f}, by paths {every - scattered:.3f} +- {error:.3f}")
     assert error < 0.0065 * ours
     assert abs(ours - (every - scattered)) < 3 * error
@@ -224,11 +226,12 @@ def test_noise_is_told():
     """Expected: an estimate is as far off as it says, and four times as many rays have half of the noise or less."""
     scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(4)
     problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
-    ids, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None]
-    exact = specular_light(problem, 9, SpecularOptions(5, 5, strata=4)).operator.rows(ids) * power
+    lit = np.flatnonzero(scene.albedo.any(axis=1))
+    ids, power = np.arange(len(lit)), problem.reflection.albedo[lit, None]
+    exact = specular_light(problem, 9, SpecularOptions(5, 5), lit).operator.rows(ids) * power
     noises = []
     for strata in (1, 2):
-        found = specular_light(problem, 4, SpecularOptions(strata, strata, strata=4))
+        found = specular_light(problem, 4, SpecularOptions(strata, strata), lit)
         true = np.linalg.norm(found.operator.rows(ids) * power - exact) / np.linalg.norm(exact)
         print(f"{strata}: told {found.noise:.3f}, true {true:.3f}, {found.rays} rays")
         assert found.noise == pytest.approx(true, rel=0.2)
@@ -259,12 +262,13 @@ def test_each_surface_on_the_way_counts():
 def test_light_is_told_apart_by_the_surfaces_it_met():
     """Expected: light that met at most 1, 2, 3 surfaces is what paths of ``max_depth`` 3, 4, 5 find, mesh by mesh.
 
-    Means under even light, within 4 standard errors and 1.5%. From one depth to the next they change by 2 to 14%.
+    Means under even light, within 4 standard errors, which are below 0.125% on floor and wall, and 1.5%. From one depth
+    to the next they change by 2 to 14%.
     """
     shapes = {name: shape for name, shape in objects(0.6).items() if name != "cut"}
     scene, lighting = build(0.2, **shapes), prt.CubemapLighting(1)
-    every, light = np.arange(scene.n_vertices), np.ones((6, 3), np.float32)
-    place = np.repeat(every, 6), np.tile(np.arange(6), len(every))
+    lit, light = np.flatnonzero(scene.albedo.any(axis=1)), np.ones((6, 3), np.float32)
+    place = np.repeat(lit, 6), np.tile(np.arange(6), len(lit))
     plan = Plan("exact", "gather", 1024, 0.01)
     transport = prt.precompute(scene, lighting, plan, "texel", 5, strata=4, progress=False)
     assert {name: transport.operators[name].kind for name in ("specular", "indirect")} == {
@@ -275,11 +279,12 @@ def test_light_is_told_apart_by_the_surfaces_it_met():
     assert ours[-1] == pytest.approx(transport.irradiance(light).mean(axis=1), rel=1e-5)
     opaque = problem_at(scene, lighting, basis="texel", max_depth=2)
     seen = DirectSolver(opaque, 4).elements(*place).reshape(-1, 6).sum(axis=1)
+    known, variance = np.zeros((2, scene.n_vertices))
     for met in (1, 2, 3):
-        paths = PathSolver(replace(opaque, max_depth=met + 2), 512).rows(every)
+        paths = PathSolver(replace(opaque, max_depth=met + 2), 384).rows(lit)
         power = lighting.solid_angles[None, :, None]
-        known = seen + (paths.mean * power).sum(axis=1).mean(axis=1)
-        variance = (paths.variance * power**2).sum(axis=1).mean(axis=1)
+        known[lit] = seen + (paths.mean * power).sum(axis=1).mean(axis=1)
+        variance[lit] = (paths.variance * power**2).sum(axis=1).mean(axis=1)
         for mesh in scene.meshes:
             part, size = mesh.vertices, mesh.vertices.stop - mesh.vertices.start
             if scene.albedo[part].any():
@@ -287,6 +292,7 @@ def test_light_is_told_apart_by_the_surfaces_it_met():
                 print(
                     f"{met} {mesh.name}: {ours[met][part].mean():.4f}, {known[part].mean():.4f} +- {error:.4f}"
                 )
+                assert error < 0.00125 * known[part].mean() or mesh.name not in ("floor", "wall")
                 assert (
                     abs(ours[met][part].mean() - known[part].mean()) < 4 * error + 0.015 * known[part].mean()
                 )
@@ -332,11 +338,12 @@ def test_images_stop_light_where_paths_end():
 
 
 @pytest.mark.usefixtures("no_held_out")
-def test_pixels_see_by_way_of_mirrors_and_glass():
+def test_pixels_see_by_way_of_mirrors_and_glass(monkeypatch):
     """Expected: at the points that a camera sees, light that is gathered is that of paths, and none is counted twice.
 
     The mean over all pixels differs by less than 1% (0.2 to 0.8% over seeds and machines). Paths that count light
-    again that passed straight find 6% more, and gathering without what arrives by mirrors and glass 11% less.
+    again that passed straight find 6% more, and gathering without what arrives by mirrors and glass 11% less. What
+    arrives at the pixels by these alone is the same in both matrices, seed by seed, and is found once.
     """
     scene, lighting = build(0.2, **objects(0.6)), prt.CubemapLighting(4)
     camera = mi.load_dict(
@@ -348,13 +355,21 @@ def test_pixels_see_by_way_of_mirrors_and_glass():
         }
     )
     pixels, light = camera_pixels(scene, camera, 4), np.repeat([[3.0] * 3, [1.0] * 3], 48, axis=0)
-    means = []
+    means, known = [], {}
+
+    def found_once(problem: Problem, *settings: object) -> SpecularLight:
+        if settings not in known:
+            known[settings] = specular_light(problem, *settings)
+        return known[settings]
+
+    monkeypatch.setattr(PIPELINE, "specular_light", found_once)
     for method, spp in (("gather", None), ("brute_force", 16)):
         transport = prt.precompute(
             scene, lighting, method, "texel", -1, spp, measurement=pixels, strata=4, progress=False
         )
         means.append(float(transport.relight(light).mean()))
     print(f"gathered {means[0]:.4f}, by paths {means[1]:.4f}")
+    assert len(known) == 1
     assert means[0] == pytest.approx(means[1], rel=0.01)
 
 
@@ -394,6 +409,7 @@ def test_light_falls_through_holes():
         )
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_the_operator_is_kept(tmp_path):
     """Through files, compression and other orders of shapes; the same seed gives the same bits."""
     scene, lighting = build(0.5, **objects(0.6)), prt.CubemapLighting(4)
