@@ -14,6 +14,9 @@ from threadpoolctl import ThreadpoolController
 
 Result = TypeVar("Result")
 
+PARTS = 8  # for each thread ...
+LONG = 64  # ... if they are at least so long
+
 
 def wait_passively() -> None:
     """Let threads of OpenMP that have nothing to do sleep, unless the environment has another wish.
@@ -54,17 +57,25 @@ def one_thread() -> Iterator[None]:
 
 
 def run_in_parts(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-    """Call ``kernel(start, end, *arguments)`` for parts of ``range(count)``, one for each thread numba would use.
+    """Call ``kernel(start, end, *arguments)`` for parts of ``range(count)``, in as many threads as numba would use.
 
     For compiled functions that let go of the interpreter (``nogil=True``) and whose parts write to places of their
-    own. numba compiles a loop of ``prange`` several times over: these compile in a half to a third of the time.
+    own. numba compiles a loop of ``prange`` several times over: these compile in a half to a third of the time. Threads
+    take part after part, as some take longer than others.
     """
     import numba  # as above
 
-    parts = max(min(numba.get_num_threads(), count), 1)
+    threads = max(min(numba.get_num_threads(), count), 1)
+    parts = threads * (PARTS if threads > 1 and count >= PARTS * threads * LONG else 1)
     bounds = [count * part // parts for part in range(parts + 1)]
-    others = [_pool().submit(kernel, *part, *arguments) for part in zip(bounds[1:], bounds[2:], strict=False)]
-    kernel(bounds[0], bounds[1], *arguments)
+    remaining = iter(list(zip(bounds, bounds[1:], strict=False)))
+
+    def work() -> None:
+        for part in remaining:
+            kernel(*part, *arguments)
+
+    others = [_pool().submit(work) for _ in range(threads - 1)]
+    work()
     for future in others:
         future.result()
 

@@ -8,10 +8,11 @@ import threading
 import time
 
 import numba
+import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mi_sparse_prt.core.threads import run_overlapped
+from mi_sparse_prt.core.threads import run_in_parts, run_overlapped
 
 
 def test_results_come_in_the_order_of_their_tasks() -> None:
@@ -89,3 +90,28 @@ def test_libraries_that_numba_loads_later_are_limited_too() -> None:
     limits = json.loads(run.stdout)
     assert len(limits) >= 2
     assert set(limits) == {1}
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 700, 5000])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_parts_are_the_whole_once(count: int, threads: int) -> None:
+    """Expected: every number of the range is in one part, however long it is; errors of any thread come out."""
+    before, visits = numba.get_num_threads(), np.zeros(count, int)
+    numba.set_num_threads(min(threads, before))
+    try:
+
+        def visit(start: int, end: int, into: np.ndarray) -> None:
+            into[start:end] += 1
+
+        run_in_parts(visit, count, visits)
+        assert np.all(visits == 1)
+
+        def fail(start: int, end: int) -> None:
+            if start <= count - 1 < end:
+                raise ValueError("the last one")
+
+        if count:
+            with pytest.raises(ValueError, match="the last one"):
+                run_in_parts(fail, count)
+    finally:
+        numba.set_num_threads(before)
