@@ -266,7 +266,7 @@ class LightTransport:
             raise PrtError(f"{together} lights together: give 1 or more")
         found: list[Floats] = []
         for first, block in _blocks_of(self.emission, lights, together):
-            colours = self._apply_lit(block)
+            colours = self.apply(block)
             if into is None:
                 found.append(colours)
             elif callable(into):
@@ -276,16 +276,6 @@ class LightTransport:
         if into is not None:
             return None
         return np.concatenate(found, axis=2) if found else np.zeros((self.shape[0], 3, 0), np.float32)
-
-    def _apply_lit(self, lights: Floats) -> Floats:
-        """``apply``; what is black, such as nights, takes no time."""
-        lit = lights.any(axis=(0, 1))
-        if lit.all():
-            return self.apply(lights)
-        colours = np.zeros((self.shape[0], *lights.shape[1:]), np.float32)
-        if lit.any():
-            colours[..., lit] = self.apply(np.ascontiguousarray(lights[..., lit]))
-        return colours
 
     def leaving(self, incident: Floats, outgoing: ArrayLike | None = None) -> Floats:
         """What leaves points whose incident light (rows, 3) is known; ``outgoing`` and result as of ``relight``."""

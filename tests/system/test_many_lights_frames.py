@@ -86,10 +86,10 @@ def test_frames_flicker_less_than_pictures(scene, cameras, references) -> None:
 
 
 def test_frames_are_right_on_average(scene, cameras) -> None:
-    """40 seeds of two frames, few rows. Expected: on average all lights of the same seed, within 4 standard errors."""
+    """20 seeds of two frames, few rows. Expected: on average all lights of the same seed, within 4 standard errors."""
     pair = cameras[::7]
     apart, whole = [], []
-    for seed in range(40):
+    for seed in range(20):
         found = frames_of(scene, pair, 20, 60, seed=seed)
         whole.append(all_lights(scene, pair, seed).mean(axis=(1, 2)))
         apart.append(found.mean(axis=(1, 2)) - whole[-1])

@@ -149,7 +149,7 @@ def test_many_lights_are_those_one_by_one(transport):
 
 
 def test_nights_and_dark_ground_change_nothing(transport):
-    """Lights that are black, and texels that all are black at, are left out. Expected: as one by one; nights are 0."""
+    """Texels at which all lights are black are left out. Expected: as one by one; black lights give black."""
     lights = np.random.default_rng(3).random((6 * N * N, 3, 70), dtype=np.float32)
     lights[: 2 * N * N] = 0
     lights[:, :, [4, 5, 40]] = 0
