@@ -19,7 +19,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.variant import check_variant
-from mi_sparse_prt.manylights.elements import Elements, ReducedColumns
+from mi_sparse_prt.manylights.elements import Done, Elements, ReducedColumns
 from mi_sparse_prt.manylights.image import ManyLightsImage
 from mi_sparse_prt.manylights.lights import scene_lights
 from mi_sparse_prt.manylights.render import PROJECTED, RowColumn, Settings, find_view
@@ -93,8 +93,8 @@ def _frames(
         samples = Samples(scene, surfaces, camera, asked.spp, asked.max_depth, asked.seed, asked.groups)
         return Elements(scene, surfaces, samples, lights)
 
-    with run.clock.phase("rows"):
-        reduced = _reduced_of_all(lambda k: matrix(cameras[k]), len(cameras), len(lights), asked)
+    with run.clock.phase("rows"), run.bar(asked.rows, "rows") as bar:
+        reduced = _reduced_of_all(cameras, matrix, len(lights), asked, bar.update)
     for k, camera in enumerate(cameras):
         own = Run(asked.seed, progress=run.progress) if k else run  # the first has what was done for all
         with own.clock.phase("samples"):
@@ -105,17 +105,21 @@ def _frames(
 
 
 def _reduced_of_all(
-    frame: Callable[[int], Elements], count: int, lights: int, asked: Settings
+    cameras: list[mi.Sensor],
+    matrix: Callable[[mi.Sensor], Elements],
+    lights: int,
+    asked: Settings,
+    done: Done,
 ) -> ReducedColumns:
     """Reduced columns of rows of all frames, as many of each; no frame is kept."""
     projection = random_projection(asked.rows, PROJECTED, asked.random(_PROJECT))
     projected, squares = np.zeros((lights, projection.shape[1]), np.float32), np.zeros((lights, 3))
-    for k, places in enumerate(_shared_out(asked.rows, count)):
+    for k, places in enumerate(_shared_out(asked.rows, len(cameras))):
         if len(places):
-            elements = frame(k)
+            elements = matrix(cameras[k])
             seed = int(random_stream(asked.seed, k).generate_state(1)[0])  # rows of frames differ
             ids = elements.samples.stratified_rows(len(places), seed)
-            found = elements.reduce_columns(ids, projection[places[: len(ids)]])
+            found = elements.reduce_columns(ids, projection[places[: len(ids)]], done)
             projected += found.projected
             squares += found.channel_norms**2
     return ReducedColumns(projected, np.sqrt(squares.sum(axis=1)), np.sqrt(squares))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.morton import morton_order
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.manylights.light_arrays import DIRECTION, EMITTER
 from mi_sparse_prt.manylights.lights import Lights
 
@@ -161,8 +162,28 @@ def _bounds(nodes: _Level) -> Floats:
     return np.concatenate([centres, halves * (1 + 1e-5), nodes.axes, cone], axis=1).astype(np.float32)
 
 
-@numba.njit(parallel=True, cache=True)
-def largest_values(
+def largest_values(tree: LightTree, nodes: Ids, samples: Ids, receivers: Floats, clamp: float) -> Floats:
+    """The most that lights of nodes (k,) may send to diffuse samples (k,): mean radiance (k,), nothing in between.
+
+    Parameters
+    ----------
+    tree : LightTree
+    nodes, samples : (k,) int64
+    receivers : (m, 9) float32
+        Of samples: position, normal towards the camera, world; radiance per irradiance, RGB.
+    clamp : float
+        Of the geometry terms of reflected light.
+    """
+    result = np.empty(len(nodes), np.float32)
+    bounds = tree.bounds, tree.colours, tree.far, tree.reflected
+    run_in_parts(_fill_largest, len(nodes), *bounds, nodes, samples, receivers, clamp, result)
+    return result
+
+
+@numba.njit(nogil=True, cache=True)
+def _fill_largest(
+    start: int,
+    end: int,
     bounds: Floats,
     colours: Floats,
     far: NDArray[np.bool_],
@@ -173,11 +194,7 @@ def largest_values(
     clamp: float,
     result: Floats,
 ) -> None:
-    """The most that lights of nodes (k,) may send to diffuse samples (k,): mean radiance (k,), nothing in between.
-
-    receivers : (m, 9), of which position, normal towards the camera, and the radiance per irradiance.
-    """
-    for e in numba.prange(len(nodes)):
+    for e in range(start, end):
         node, i = nodes[e], samples[e]
         most = _largest_factor(bounds[node], receivers[i], far[node], clamp if reflected[node] else np.inf)
         sent = 0.0

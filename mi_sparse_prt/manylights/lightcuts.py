@@ -16,7 +16,7 @@ from mi_sparse_prt.manylights.light_tree import LightTree, build_light_tree, lar
 
 VISIBLE = 0.02  # of a sample's light: smaller errors are not seen (Walter et al. 2005, 3)
 MOST = 1000  # nodes of a cut, as published
-TOGETHER = 4096  # samples whose cuts are in memory
+TOGETHER = 4096  # samples whose cuts are in memory; below 2^16
 
 Ids = NDArray[np.int64]
 
@@ -109,11 +109,8 @@ class _Cuts:
     def _add(self, samples: Ids, nodes: Ids, values: Floats) -> None:
         """More pairs; lights are known already, and so are nodes that can send nothing."""
         self._sizes += np.bincount(samples, minlength=len(self._sizes))
-        most = np.empty(len(nodes), np.float32)
-        tree, clamp = self._tree, self._elements.clamp
-        bounds = tree.bounds, tree.colours, tree.far, tree.reflected
-        largest_values(*bounds, nodes, samples, self._receivers, clamp, most)
-        open_ = (tree.children[nodes, 0] >= 0) & (most > 0)
+        most = largest_values(self._tree, nodes, samples, self._receivers, self._elements.clamp)
+        open_ = (self._tree.children[nodes, 0] >= 0) & (most > 0)
         for c in range(3):
             self._settled[:, c] += np.bincount(samples[~open_], values[~open_, c], len(self._settled))
         self._samples = np.concatenate([self._samples, samples[open_]])

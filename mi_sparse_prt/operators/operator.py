@@ -22,11 +22,10 @@ from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_overlapped
 
 Ids = NDArray[np.integer]
-MANY = 64  # vectors of which a product takes longer than to copy some columns of a matrix
-
 Floats = NDArray[np.float32]
 
 ROWS = 2048  # expanded at a time
+MANY = 64  # vectors of which a product takes longer than to copy some columns of a matrix
 CACHED_ROWS = 256  # expanded at a time where some of them stay in the cache until they are used
 
 

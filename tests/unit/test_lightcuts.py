@@ -123,10 +123,8 @@ def test_no_node_sends_more_than_its_bound(matrix: Elements, whole: np.ndarray, 
     for node in range(n, len(tree.children)):
         lights = members(tree, node)
         sent = whole[:, lights].mean(axis=2).sum(axis=1)
-        most = np.empty(len(sent), np.float32)
         samples, nodes = np.arange(len(sent)), np.full(len(sent), node)
-        bounds = tree.bounds, tree.colours, tree.far, tree.reflected
-        largest_values(*bounds, nodes, samples, cuts._receivers, matrix.clamp, most)
+        most = largest_values(tree, nodes, samples, cuts._receivers, matrix.clamp)
         assert np.all(sent <= most * (1 + 1e-3) + 1e-9), node
         if len(lights) <= 8:
             ratios.append(most[sent > 0] / sent[sent > 0])

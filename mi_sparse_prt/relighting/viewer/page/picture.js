@@ -82,7 +82,7 @@ void main() {
 #ifdef TEXTURED
   vec3 albedo = texture(image, uv).rgb;
 #endif
-  uint drawn = seen > 0.0 ? mesh + 1u : 0u; // one-sided surfaces are black from behind
+  uint drawn = seen > 0.0 ? min(mesh + 1u, 65535u) : 0u; // one-sided surfaces are black from behind
   pixel = uvec4(triangle + 1, packUnorm2x16(within), packUnorm2x16(albedo.rg), packUnorm2x16(vec2(albedo.b, 0.0)) | drawn << 16);
 }`;
 
