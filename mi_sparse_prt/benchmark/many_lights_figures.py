@@ -1,4 +1,4 @@
-"""What the benchmark of many lights draws: [HPB07] Figures 3 to 6."""
+"""What the benchmark of many lights draws: [HPB07] Figures 3 to 7, by scene."""
 
 from __future__ import annotations
 
@@ -23,13 +23,22 @@ STYLES = {"1:1": "-", "1:2": "--", "1:3": "-.", "3:1": ":"}
 
 
 def many_lights_figures(
-    report: dict[str, Any], pictures: dict[str, NDArray[np.float32]]
+    report: dict[str, Any],
+    pictures: dict[str, NDArray[np.float32]],
+    equal_time: dict[str, NDArray[np.float32]],
 ) -> dict[str, Figure]:
     """Figures of a report of ``measure_many_lights``, by the names of their files."""
+    reference = pictures["reference"]
+    took = {point["name"]: point for point in report["equal_time"]}
+    beside = {
+        f"{name}: {took[name]['seconds']:.1f} s, {100 * took[name]['error']:.1f}% off": image
+        for name, image in equal_time.items()
+    }
     return {
         "many_lights": _time_against_error(report),
         "singular_values": _singular_values(report),
         "pictures": _pictures(pictures),
+        "equal_time": _pictures({"reference": reference, **beside}),
     }
 
 
@@ -51,7 +60,7 @@ def _time_against_error(report: dict[str, Any]) -> Figure:
     size = report["scene"]
     axes.set(
         xscale="log", yscale="log", xlabel="seconds (samples and lights not counted)",
-        ylabel="relative 2-norm error of the image (%)",
+        ylabel="relative 2-norm error of pixels (%)",
         title=f"{Path(size['path']).stem}: {size['samples']:,} samples, {size['lights']:,} lights",
     )  # fmt: skip
     axes.grid(which="both", alpha=0.25)

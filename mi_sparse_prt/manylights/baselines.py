@@ -11,36 +11,38 @@ import numpy as np
 
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.io.checkpoint import Checkpoint
-from mi_sparse_prt.manylights.elements import Elements, Floats
+from mi_sparse_prt.manylights.elements import Elements, Floats, Ids
 from mi_sparse_prt.manylights.estimate import Representatives
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
 
-RECORD = 4096  # samples that are finished together
+RECORD = 4096  # rows that are finished together
 
 
-def all_lights(elements: Elements, run: Run, folder: Path | None = None) -> Floats:
-    """The sum of all columns (m, 3): what the others estimate.
+def all_lights(elements: Elements, run: Run, rows: Ids, folder: Path | None = None) -> Floats:
+    """The sums (len(rows), 3) of all columns at some rows: what the others estimate.
 
     Parameters
     ----------
     elements : Elements
     run : Run
         Shows progress.
+    rows : (k,) integers
     folder : Path, optional
-        Where finished samples are kept, under a name that stands for samples and lights: an interrupted run goes on,
-        and a finished one is read.
+        Where finished rows are kept, under a name that stands for rows, samples and lights: an interrupted run goes
+        on, and a finished one is read.
     """
-    m, n = elements.shape
-    found = np.zeros((m, 3), np.float32)
-    kept = Checkpoint(folder / f"all_lights_{_hash(elements)}.rows", found) if folder is not None else None
+    found = np.zeros((len(rows), 3), np.float32)
+    kept = (
+        Checkpoint(folder / f"all_lights_{_hash(elements, rows)}.rows", found) if folder is not None else None
+    )
     first = 0 if kept is None else kept.rows_done
-    with run.bar(m, "all lights", " samples", first) as bar:
-        for a in range(first, m if n else 0, RECORD):
-            part = slice(a, min(a + RECORD, m))
-            found[part] = elements.sum_of_rows(a, part.stop - a)
-            bar.update(part.stop - a)
+    with run.bar(len(rows), "all lights", " samples", first) as bar:
+        for a in range(first, len(rows) if len(elements.lights) else 0, RECORD):
+            part = rows[a : a + RECORD]
+            found[a : a + RECORD] = elements.sum_of_rows(part)
+            bar.update(len(part))
             if kept is not None:
-                kept.append(found[part])
+                kept.append(found[a : a + RECORD])
     return found
 
 
@@ -77,15 +79,15 @@ def draw_by_power(flux: np.ndarray, count: int, rng: np.random.Generator) -> Rep
     return Representatives(ids, np.repeat(scale[:, None], 3, axis=1).astype(np.float32))
 
 
-def _hash(elements: Elements) -> str:
-    """Stands for samples and lights: what the first of them are, and the sums over some columns of some rows."""
-    state = hashlib.sha256()
+def _hash(elements: Elements, rows: Ids) -> str:
+    """Stands for rows, samples and lights, and for how they look to each other: some elements."""
+    state = hashlib.sha256(np.asarray(rows, np.int64).tobytes())
     m, n = elements.shape
     state.update(np.array([m, n, elements.lights.clamp, elements.samples.max_depth]).tobytes())
     state.update(elements.lights.arrays.power.numpy().tobytes())
     state.update(mi.Point3f(elements.lights.arrays.place).numpy().tobytes())
     state.update(elements.samples.seen.tobytes() + elements.samples.ids.tobytes())
     if m and n:
-        rows, columns = np.linspace(0, m - 1, 64).astype(int), np.linspace(0, n - 1, 64).astype(int)
-        state.update(elements.block(rows, columns).tobytes())
+        some, columns = np.linspace(0, m - 1, 64).astype(int), np.linspace(0, n - 1, 64).astype(int)
+        state.update(elements.block(some, columns).tobytes())
     return state.hexdigest()[:24]

@@ -152,16 +152,16 @@ class Elements:
         self.evaluated += m * count
         return self._by_sample(total, chosen, np.unique(ids))
 
-    def sum_of_rows(self, first: int, count: int) -> Floats:
-        """Sums (count, 3) of all elements of rows that follow each other, in double precision."""
-        n = len(self.lights)
-        chosen = _on_device(np.arange(n), np.ones((n, 3), np.float32), np.arange(first, first + count))
+    def sum_of_rows(self, ids: Ids) -> Floats:
+        """Sums (len(ids), 3) of all elements of rows, in double precision."""
+        n, count = len(self.lights), len(ids)
+        chosen = _on_device(np.arange(n), np.ones((n, 3), np.float32), np.asarray(ids))
         found = np.zeros((count, 3))
         for start, size in _pieces(n, max(1, LANES // max(count, 1))):
             part = self._accumulated(dr.zeros(mi.Color3f, count), chosen, start, size)
             found += part.numpy().T
         self.evaluated += n * count
-        self._check_sum(found.astype(np.float32), np.arange(n), first)
+        self._check_sum(found.astype(np.float32), np.arange(n), np.asarray(ids))
         return found.astype(np.float32)
 
     def each_column(self, ids: Ids, weights: Floats, done: Done = lambda _: None) -> Iterator[Floats]:
@@ -381,10 +381,10 @@ class Elements:
         self._check_sum(found, columns)
         return found
 
-    def _check_sum(self, found: Floats, columns: Ids, first: int = 0) -> None:
+    def _check_sum(self, found: Floats, columns: Ids, rows: Ids | None = None) -> None:
         bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
         if len(bad):
-            self.block(bad[:1] + first, columns)  # names it
+            self.block(bad[:1] if rows is None else rows[bad[:1]], columns)  # names it
 
     def _check_rows(self, norms: Floats, rows: Ids) -> None:
         bad = np.flatnonzero(~np.isfinite(norms).all(axis=1))

@@ -60,7 +60,7 @@ def all_lights_image(scene: mi.Scene, max_depth: int, seed: int) -> np.ndarray:
     count = 1000 if max_depth == 2 else 3000
     options = LightOptions(count, max_depth=max_depth, clamp=np.inf, seed=seed)
     elements = Elements(scene, surfaces, samples, scene_lights(scene, options))
-    return samples.image(elements.sum_of_rows(0, len(samples)))
+    return samples.image(elements.sum_of_rows(np.arange(len(samples))))
 
 
 def blocks(images: list[np.ndarray]) -> np.ndarray:
@@ -209,7 +209,7 @@ def test_the_same_error_is_predicted_and_found() -> None:
         surfaces = Surfaces(scene)
         samples = Samples(scene, surfaces, scene.sensors()[0], 4, 3, seed)
         lights = scene_lights(scene, LightOptions(2000, max_depth=3, seed=seed))
-        exact = samples.image(Elements(scene, surfaces, samples, lights).sum_of_rows(0, len(samples)))
+        exact = samples.image(Elements(scene, surfaces, samples, lights).sum_of_rows(np.arange(len(samples))))
         true.append(((found.image - exact) ** 2).sum() / (exact**2).sum())
         predicted.append(found.report["estimated_error"] ** 2)
     ratio = np.sqrt(np.mean(predicted) / np.mean(true))

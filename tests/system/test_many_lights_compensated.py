@@ -94,7 +94,7 @@ def rendered(
     found = []
     for seed in range(sets):
         elements = elements_of(scene, max_depth, clamp, seed, lights)
-        values = elements.sum_of_rows(0, len(elements.samples))
+        values = elements.sum_of_rows(np.arange(len(elements.samples)))
         left_out = every_path(elements, seed)
         found.append((grey(elements, values), grey(elements, values + left_out.values)))
     return np.array([plain for plain, _ in found]), np.array([whole for _, whole in found])

@@ -115,6 +115,8 @@ def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_pa
         "PATH_SPP": (1, 64),
         "SINGULAR": (20, 20),
         "COUNT": 300,
+        "SEEDS": 2,
+        "EQUAL_TIME": (8, 16),
     }.items():
         monkeypatch.setattr(benchmark, name, value)
     report, figures = tmp_path / "b.json", tmp_path / "plots"
@@ -125,5 +127,7 @@ def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_pa
     for points in found["curves"].values():
         assert points[-1]["error"] < 0.5 and points[-1]["seconds"] > 0
     assert found["singular_values"][0] == 1 and found["path"][0]["error"] > found["path"][-1]["error"]
+    assert found["reference"]["picture"] == "all lights" and found["reference"]["picture_error"] == 0
+    assert [point["flip"] is None for point in found["equal_time"]] == [False] * 4 + [True]
     names = {path.name for path in figures.iterdir()}
-    assert {"many_lights.png", "singular_values.png", "pictures.png"} <= names
+    assert {"many_lights.png", "singular_values.png", "pictures.png", "equal_time.png"} <= names

@@ -10,6 +10,7 @@ import pytest
 from conftest import diffuse
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.benchmark.many_lights_reference import Reference
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.manylights import elements as elements_module
 from mi_sparse_prt.manylights.baselines import all_lights, draw_by_power, instant_radiosity
@@ -25,6 +26,7 @@ from mi_sparse_prt.manylights.estimate import (
     sum_with_error,
 )
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
+from mi_sparse_prt.manylights.render import Settings
 from mi_sparse_prt.manylights.samples import Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
 
@@ -111,7 +113,7 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
         means = np.zeros((256, 3))
         np.add.at(means, pixel, np.where(own, -apart[1], apart[0]) / 4)
         assert squares[k] == pytest.approx((means**2).sum(), rel=1e-4)
-    assert matrix.sum_of_rows(10, 30) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
+    assert matrix.sum_of_rows(np.arange(10, 40)) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
 
 
 def test_reduced_columns_are_norms_of_colours_projected(matrix: Elements, whole: np.ndarray) -> None:
@@ -300,12 +302,36 @@ def test_with_as_many_clusters_as_lights_nothing_is_lost(matrix: Elements, whole
 
 def test_all_lights_go_on_after_an_interruption(matrix: Elements, whole: np.ndarray, tmp_path) -> None:
     expected = whole.sum(axis=1)
-    assert all_lights(matrix, Run(), tmp_path) == pytest.approx(expected, rel=1e-5)
+    assert all_lights(matrix, Run(), np.arange(len(whole)), tmp_path) == pytest.approx(expected, rel=1e-5)
     before = matrix.evaluated
-    assert all_lights(matrix, Run(), tmp_path) == pytest.approx(expected, rel=1e-5)
+    assert all_lights(matrix, Run(), np.arange(len(whole)), tmp_path) == pytest.approx(expected, rel=1e-5)
     assert matrix.evaluated - before <= 64 * 64  # what the name is made of
     other = instant_radiosity(matrix, 300, LightOptions(max_depth=3, seed=9))
     assert other.mean() == pytest.approx(expected.mean(), rel=0.1)
+
+
+@pytest.mark.parametrize("pixels", [60, 150])
+def test_errors_at_some_pixels_are_those_of_the_image(
+    small_room: mi.Scene, matrix: Elements, whole: np.ndarray, tmp_path, pixels: int
+) -> None:
+    """Expected: errors of pictures that are off by noise and by a factor, within 3 standard errors."""
+    settings = Settings(lights=300, max_depth=3)
+    some, every = (Reference(matrix, Run(), tmp_path, count) for count in (pixels, 10**6))
+    assert every.is_whole and not some.is_whole and len(some.pixels) == pixels
+    truth, rng = every.values(settings), np.random.default_rng(0)
+    assert truth == pytest.approx(whole.sum(axis=1), rel=1e-5) and every.error(truth) == (0, 0)
+    image = matrix.samples.image(truth)
+    assert every.radiance.reshape(image.shape) == pytest.approx(image, rel=1e-4)  # its filter is a box
+    for values in (
+        truth * np.float32([1.03, 1, 0.98]),
+        truth * rng.uniform(0.5, 1.5, truth.shape).astype(np.float32),
+    ):
+        error, uncertainty = some.error(values)
+        expected = np.linalg.norm(matrix.samples.image(values) - image) / np.linalg.norm(image)
+        assert every.error(values)[0] == pytest.approx(expected, rel=1e-3)
+        assert 0 < uncertainty < 0.25 * expected and abs(error - expected) < 3 * uncertainty
+    assert some.square() == pytest.approx(every.square(), rel=0.3)
+    assert some.error(some.values(settings))[0] < 0.01
 
 
 # -- lights -----------------------------------------------------------------------------------------------------------

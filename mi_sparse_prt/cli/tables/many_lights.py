@@ -77,7 +77,7 @@ def many_lights_tables(report: dict[str, Any]) -> list[Table]:
         ]
     )
     columns = ("", "rows/columns", "time", "error", "over seeds", "predicted")
-    return [new_table(title, columns, *sections), _phases(report)]
+    return [new_table(title, columns, *sections), _phases(report), _at_equal_time(report)]
 
 
 def _phases(report: dict[str, Any]) -> Table:
@@ -89,10 +89,30 @@ def _phases(report: dict[str, Any]) -> Table:
             *(duration(row["seconds"][name]) for name in names),
             f"{report['all_lights']['seconds'] / row['seconds']['total']:.0f} x",
             percent(row["error"]),
+            "" if row["predicted"] is None else percent(row["predicted"]),
+            percent(row["spread"]),
             f"{row['flip']:.3f}",
             byte_count(row["peak_memory_bytes"]),
         )
         for row in report["table"]
     ]
-    columns = ("", "total", *names, "all lights", "error", "FLIP", "memory")
-    return new_table("By phase; occlusion rays in place of shadow maps", columns, rows)
+    known = report["reference"]
+    title = (
+        f"By phase; occlusion rays in place of shadow maps. Errors at {known['pixels']:,} pixels; "
+        f"FLIP against {known['picture']}, {percent(known['picture_error'])} off"
+    )
+    columns = ("", "total", *names, "all lights", "error", "predicted", "over seeds", "FLIP", "memory")
+    return new_table(title, columns, rows)
+
+
+def _at_equal_time(report: dict[str, Any]) -> Table:
+    rows = [
+        (
+            point["name"],
+            duration(point["seconds"]),
+            percent(point["error"]),
+            "" if point["flip"] is None else f"{point['flip']:.3f}",
+        )
+        for point in report["equal_time"]
+    ]
+    return new_table("At equal time; the error of path is its noise", ("", "time", "error", "FLIP"), rows)
