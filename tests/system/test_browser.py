@@ -146,17 +146,19 @@ def test_a_picture_is_that_of_render(page, exported, artefact):
 
 
 def test_the_background_turns_with_the_light(page, exported):
-    """A camera that sees the sky alone. Expected: that of ``render`` to 8 bits; turned the other way, it is not."""
+    """A camera that sees the sky alone. Expected: that of ``render``, as far as a JPEG keeps it; turned the other way, it is not."""
     scene, transport, _, _ = exported
     page.execute_script("v.camera.eye = [0, 8, 0]; v.camera.target = [0.4, 8.9, -0.5]")
     view = page.execute_script("const {eye, target, up, height} = v.camera; return {eye, target, up, height}")
     sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
-    for how in TURNS:
+    for number, how in enumerate(TURNS[:4]):
         ours = linear(picture(page, "v.set({environment: 1, exposure: -2, ...arguments[0]})", how))
-        for turn, alike in ((turn_matrix(**how), True), (turn_matrix(**how).T, False)):
-            theirs = prt.render(scene, transport, LIGHTS["second"].rotated(turn), sensor, 16) / 4
-            if alike or how != TURNS[0]:
-                assert (relative_l2(ours, theirs) < 0.02) == alike, how
+        light, turn = LIGHTS["second"], turn_matrix(**how)
+        right, wrong = (
+            prt.render(scene, transport, light.rotated(t), sensor, 16) / 4 for t in (turn, turn.T)
+        )
+        assert relative_l2(ours, right) < 0.06, how
+        assert number == 0 or relative_l2(ours, wrong) > 0.3, how
 
 
 def test_colours_of_vertices_are_those_of_python(page, exported):
