@@ -146,7 +146,7 @@ def test_a_picture_is_that_of_render(page, exported, artefact):
 
 
 def test_the_background_turns_with_the_light(page, exported):
-    """A camera that sees the sky alone. Expected: that of ``render``, as far as a JPEG keeps it; turned the other way, it is not."""
+    """A camera that sees the sky alone. Expected: that of ``render``, as far as a JPEG keeps it, turned as it is."""
     scene, transport, _, _ = exported
     page.execute_script("v.camera.eye = [0, 8, 0]; v.camera.target = [0.4, 8.9, -0.5]")
     view = page.execute_script("const {eye, target, up, height} = v.camera; return {eye, target, up, height}")
