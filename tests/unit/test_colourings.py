@@ -23,6 +23,7 @@ from mi_sparse_prt.relighting.viewer.colourings import (
 )
 from mi_sparse_prt.sampling.consensus import Consensus
 
+DATA = Path(__file__).parents[1] / "data"
 LIGHTING = prt.CubemapLighting(8)
 OPTIONS = {"spp": 4, "max_depth": 3, "progress": False}
 
@@ -111,8 +112,7 @@ def test_dense_vertices_follow_the_order_of_the_scene(scene, sparse):
 
 
 def test_files_without_them_are_read(tmp_path):
-    data = Path(__file__).parents[1] / "data"
-    old = prt.load_transport(data / "version_6_0.prt")
+    old = prt.load_transport(DATA / "version_6_0.prt")
     assert old.dense_vertices is None and "older" in colourings(old)["dense"]
     transport = replace(made_up("bits"), dense_vertices=np.array([1, 5]))
     transport.save(tmp_path / "a.prt")
@@ -167,6 +167,19 @@ def test_colours_say_what_they_are_of(scene, sparse):
     arrays, words = in_page(found, order)
     assert_array_equal(arrays["denseColours"], found["dense"].colours[order])
     assert set(words["legends"]) == {"clusters", "rank", "dense"} and not words["unknown"]
+
+
+def test_terms_have_the_colours_of_their_vertices():
+    """A glossy vertex has several rows in one cluster. Expected: a colour for each vertex, that of its cluster."""
+    glossy = prt.load_transport(DATA / "version_6_glossy_clusters.prt")
+    labels, count = glossy.operators["compressed"].labels, len(glossy.measurement)
+    assert len(labels) > count
+    found = colourings(glossy)
+    for name in ("clusters", "rank"):
+        assert found[name].colours.shape == (count, 3)
+    _, of_colours = np.unique(found["clusters"].colours, axis=0, return_inverse=True)
+    for cluster in np.unique(labels[:count]):
+        assert len(np.unique(of_colours.ravel()[labels[:count] == cluster])) == 1
 
 
 def test_ranks_of_wavelets_are_counts(sparse):

@@ -15,9 +15,7 @@ from mi_sparse_prt.operators.haar_rows import HaarRows
 from mi_sparse_prt.transport import LightTransport
 
 GOLDEN = 0.6180339887498949  # colours of neighbouring clusters differ by this part of the circle of hues
-HELD = (
-    0.95  # of what all basis vectors of a cluster add to its mean, squared: as many as hold this are its rank
-)
+HELD = 0.95  # of what a cluster's basis vectors add to its mean, squared: as many as hold this are its rank
 DENSE, OTHERS = (255, 176, 48), (48, 58, 84)
 
 Colours = NDArray[np.uint8]
@@ -95,9 +93,8 @@ def cluster_ranks(operator: Clustered) -> Ints:
 
     All clusters have the same number of vectors, whether they need them or not.
     """
-    squares = np.square(operator.coefficients, dtype=np.float32).sum(
-        axis=1
-    )  # [row, vector]: they are orthonormal
+    # vectors are orthonormal, so that squares of coefficients add up to those of rows
+    squares = np.square(operator.coefficients, dtype=np.float32).sum(axis=1)  # [row, vector]
     energies = np.zeros(operator.bases.shape[:2])
     np.add.at(energies, operator.labels, squares)
     held = np.cumsum(-np.sort(-energies, axis=1), axis=1)  # by the largest ones
@@ -110,9 +107,7 @@ def _dense(transport: LightTransport) -> Colouring | str:
     """Vertices whose rows were sampled themselves, bright; the others', dark, follow from theirs."""
     ids, count = transport.dense_vertices, len(transport.measurement)
     if ids is None:
-        return (
-            "Dense vertices are not known: all were sampled alike, or the file is older than this colouring."
-        )
+        return "Dense vertices are not known: all were sampled alike, or the file is older than this colour."
     colours = np.full((count, 3), OTHERS, np.uint8)
     colours[ids] = DENSE
     return Colouring(colours, f"{len(ids):,} of {count:,} vertices (bright) were sampled themselves")

@@ -184,7 +184,7 @@ class Viewer {
       const value = parseFloat(given.get(name));
       if (Number.isFinite(value)) changes[name] = value;
     }
-    if (AXES[given.get("axis")]) changes.axis = given.get("axis");
+    if (Object.hasOwn(AXES, given.get("axis"))) changes.axis = given.get("axis");
     const tip = (given.get("tip") || "").split(",").map(parseFloat);
     if (tip.length === 3 && tip.every(Number.isFinite)) changes.tip = tip;
     if (given.has("camera")) this.camera.state = given.get("camera");
