@@ -86,6 +86,9 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
         operator.shape[:2] != rows for operator in operators.values()
     ):
         raise ValueError("arrays are not all of the same points")
+    dense = arrays.get("dense_vertices")
+    if dense is not None and np.any(dense >= len(measurement)):
+        raise ValueError("dense vertices that the matrix does not have")
     return LightTransport(
         lighting,
         attributes["basis"],
@@ -95,6 +98,7 @@ def _assembled(path: Path, attributes: dict[str, Any], arrays: Arrays) -> LightT
         operators,
         attributes["scene_hash"],
         attributes["report"],
+        None if dense is None else dense.astype(np.int64),
     )
 
 

@@ -80,6 +80,9 @@ class LightTransport:
     scene_hash : str
     report : dict
         What was done, skipped, how long it took and how good it is; JSON as it is.
+    dense_vertices : (k,) int64, optional
+        Ascending: vertices whose rows were sampled themselves, and from which those of others follow ([HR10] 4.1). None
+        where all vertices were treated alike, and of files that were written before this was kept.
     """
 
     emission: EmissionSpace
@@ -90,6 +93,7 @@ class LightTransport:
     operators: Mapping[str, Operator]
     scene_hash: str
     report: dict[str, Any] = field(default_factory=dict)
+    dense_vertices: NDArray[np.int64] | None = None
 
     def __repr__(self) -> str:
         """One line: what it is of, and how well it is known; its arrays may have billions of numbers."""
@@ -397,10 +401,11 @@ class LightTransport:
         source = row_order(self.scene_hash, self.measurement.keys, scene)
         if source is None:
             return replace(self, measurement=known)
-        rows = self.reflection.rows_of(source)
+        rows, dense = self.reflection.rows_of(source), self.dense_vertices
         return replace(
             self,
             measurement=known,
+            dense_vertices=None if dense is None else np.flatnonzero(np.isin(source, dense)),
             reflection=self.reflection.take(source),
             operators={name: operator.take(rows) for name, operator in self.operators.items()},
         )
@@ -467,6 +472,8 @@ class LightTransport:
         }
         arrays = {f"measurement.{name}": array for name, array in self.measurement.arrays().items()}
         arrays |= {f"reflection.{name}": array for name, array in self.reflection.arrays().items()}
+        if self.dense_vertices is not None:
+            arrays["dense_vertices"] = self.dense_vertices.astype(np.uint32)
         kinds = dict[str, str]()
         for name, operator in self.operators.items():
             own_kinds, own = operator_arrays(operator, name)

@@ -110,7 +110,8 @@ class Execution:
         state = by_consensus(self._solver, self._run)
         rays = int(count_bits(state.evaluated).sum())
         bits = Visibility(state.visible, self._problem.points.normals, self._solver.lighting)
-        return MethodResult(bits, None, rays, {"direct": rays, "indirect": 0}, {"direct": rays})
+        account = {"direct": rays, "indirect": 0}
+        return MethodResult(bits, None, rays, account, {"direct": rays}, dense=state.sampled_themselves)
 
     def _edges(self) -> MethodResult:
         """All texels' centres, and where visibility changes between these."""
@@ -231,6 +232,7 @@ def matrix_of(problem: Problem, parts: MethodResult) -> LightTransport:
         problem.reflection,
         operators,
         problem.scene.hash,
+        dense_vertices=parts.dense,
     )
 
 

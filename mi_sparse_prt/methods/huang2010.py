@@ -125,6 +125,7 @@ def huang2010_parts(
             mesh.name: _rates(mesh, dense, per_dense, sparse, evaluated, direct.lighting.n_directions)
             for mesh in scene.meshes
         },
+        dense=np.sort(dense.ids),
     )
 
 

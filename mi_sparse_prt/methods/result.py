@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.solvers.specular import SpecularLight
 
@@ -32,6 +35,8 @@ class MethodResult:
     radiosity : dict
         Of finite elements: ``ranks`` per channel, ``bounces``, and of glossy scenes ``noise_of_rays`` (relative L2, in
         the first bounce).
+    dense : (k,) int64 or None
+        Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
     """
 
     direct: Operator
@@ -43,3 +48,4 @@ class MethodResult:
     skipped: list[str] = field(default_factory=list)
     sampling: dict[str, Any] = field(default_factory=dict)
     radiosity: dict[str, Any] = field(default_factory=dict)
+    dense: NDArray[np.int64] | None = None

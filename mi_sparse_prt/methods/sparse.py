@@ -97,6 +97,7 @@ def sparse_parts(
         {"direct": rays, "indirect": paths},
         {"direct": rays, "indirect_paths": paths * indirect.spp if indirect else 0},
         sampling={mesh.name: _rates(mesh, dense, either, grid) for mesh in scene.meshes},
+        dense=np.sort(dense.ids),
     )
 
 

@@ -80,12 +80,19 @@ class Consensus:
         self.options = options or ConsensusOptions()
         self.above = above_horizon(normals, grid.lighting.directions)
         self.visible, self.evaluated = np.zeros_like(self.above), np.zeros_like(self.above)
+        self._sampled: list[Ids] = []
+
+    @property
+    def sampled_themselves(self) -> NDArray[np.int64]:
+        """Vertices (k,) that asked no neighbours, ascending."""
+        return np.sort(np.concatenate([np.zeros(0, np.int64), *self._sampled]))
 
     def sample(self, vertices: Ids) -> None:
         """Sample rows adaptively in angle."""
         ids = vertices.astype(np.uint32)
         rows = self._grid.sample(self._normals[vertices], lambda r, t: self._trace(ids[r], t))
         self.visible[vertices], self.evaluated[vertices] = rows.visible, rows.evaluated
+        self._sampled.append(vertices)
 
     def agree(self, vertices: Ids, near: NDArray[np.int32]) -> None:
         """Give vertices (n,) what their neighbours (n, k) agree on, and traced rays elsewhere.

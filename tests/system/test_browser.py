@@ -1,5 +1,7 @@
 """Exported pages in a browser (headless Chromium, WebGL by its software renderer), against Python."""
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from pages_in_browser import (
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import flip_map, relative_l2
 from mi_sparse_prt.emission.haar import haar_colours
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.relighting.approximations import (
     Everything,
     Incremental,
@@ -34,7 +37,10 @@ from mi_sparse_prt.relighting.approximations import (
 )
 from mi_sparse_prt.relighting.players import ClusteredPlayer
 from mi_sparse_prt.relighting.viewer import make_page
+from mi_sparse_prt.relighting.viewer.answers import page_sensor
+from mi_sparse_prt.relighting.viewer.colourings import DENSE, OTHERS, colourings
 from mi_sparse_prt.relighting.viewer.page_scene import draw_order
+from mi_sparse_prt.relighting.viewer.turning import turn_matrix
 from mi_sparse_prt.validation.matrix_figures import panels
 
 pytestmark = MARKS
@@ -44,6 +50,13 @@ FLIP = 0.05  # of a picture against Python's own
 
 
 LIGHTS = {"first": sky(1), "second": sky(2)}
+TURNS = (
+    {"degrees": 0.0, "axis": "y", "tip": [0, 0, 0]},
+    {"degrees": 130.0, "axis": "y", "tip": [0, 0, 0]},
+    {"degrees": 40.0, "axis": "y", "tip": [50, 0, -35]},
+    {"degrees": 250.0, "axis": "z", "tip": [90, 0, 0]},
+    {"degrees": 77.5, "axis": "x", "tip": [0, 120, 100]},
+)
 
 
 def shapes() -> dict:
@@ -77,7 +90,7 @@ def shapes() -> dict:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     scene = build(0.15, **shapes())
-    transport = prt.precompute(scene, LIGHTING, method="gather", target_error=0.2, progress=False)
+    transport = prt.precompute(scene, LIGHTING, method=Plan("consensus", "gather"), progress=False)
     transport = prt.compress(transport, progress=False)
     page = make_page(scene, transport, LIGHTS, kept=0.3)
     path = tmp_path_factory.mktemp("page") / "page.html"
@@ -119,15 +132,33 @@ def side_by_side(ours: np.ndarray, theirs: np.ndarray):
 
 def test_a_picture_is_that_of_render(page, exported, artefact):
     scene, transport, _, _ = exported
-    for name, degrees in (("first", 0.0), ("second", 130.0)):
+    for number, how in enumerate(TURNS):
+        name = [*LIGHTS][number % 2]
         ours = picture(
-            page, "v.set({environment: arguments[0], degrees: arguments[1]})", [*LIGHTS].index(name), degrees
+            page, "v.set({environment: arguments[0], ...arguments[1]})", [*LIGHTS].index(name), how
         )
-        theirs = prt.render(scene, transport, LIGHTS[name].rotated(degrees), 0, 256, progress=False)
+        light = LIGHTS[name].rotated(turn_matrix(**how))
+        theirs = prt.render(scene, transport, light, 0, 256, progress=False)
         away = flip_map(np.clip(theirs, 0, 1), linear(ours)).mean()
-        artefact(side_by_side(linear(ours), theirs), name)
-        assert away < FLIP, f"{name}: {away:.4f}"
+        artefact(side_by_side(linear(ours), theirs), f"turn {number}")
+        assert away < FLIP, f"{name} {how}: {away:.4f}"
         assert relative_l2(linear(ours), np.clip(theirs, 0, 1)) < 0.06
+
+
+def test_the_background_turns_with_the_light(page, exported):
+    """A camera that sees the sky alone. Expected: that of ``render``, as far as a JPEG keeps it, turned as it is."""
+    scene, transport, _, _ = exported
+    page.execute_script("v.camera.eye = [0, 8, 0]; v.camera.target = [0.4, 8.9, -0.5]")
+    view = page.execute_script("const {eye, target, up, height} = v.camera; return {eye, target, up, height}")
+    sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
+    for number, how in enumerate(TURNS[:4]):
+        ours = linear(picture(page, "v.set({environment: 1, exposure: -2, ...arguments[0]})", how))
+        light, turn = LIGHTS["second"], turn_matrix(**how)
+        right, wrong = (
+            prt.render(scene, transport, light.rotated(t), sensor, 16) / 4 for t in (turn, turn.T)
+        )
+        assert relative_l2(ours, right) < 0.06, how
+        assert number == 0 or relative_l2(ours, wrong) > 0.3, how
 
 
 def test_colours_of_vertices_are_those_of_python(page, exported):
@@ -211,6 +242,9 @@ def test_turning_and_moving_change_the_picture(page):
         "v.set({exposure: 1})",
         "v.set({colours: 'light'})",
         "v.set({colours: 'clusters'})",
+        "v.set({colours: 'radiance'})",
+        "v.turn(0, 40)",
+        "v.set({axis: 'x'})",
         "v.set({environment: 1, colours: 'radiance'})",
         "v.camera.orbit(0.5, 0.2)",
         "v.camera.dolly(0.7)",
@@ -238,15 +272,115 @@ def test_dragging_and_keys(page):
     assert turned[0] == moved[0] and turned[1] != moved[1] and turned[2] == moved[2] + 0.25
 
 
+def test_dragging_tips_the_light(page):
+    """With control, down the picture: light from behind the camera goes down, by half a turn for the picture's height.
+
+    Shift alone never tips it, a key sets it upright again, and the camera stays where it is.
+    """
+    driver, keys = page, webdriver.Keys
+    canvas, camera = driver.find_element("id", "view"), driver.execute_script("return v.camera.state")
+    height = canvas.size["height"]
+
+    def dragged(key, across, down):
+        actions = webdriver.ActionChains(driver, duration=20).key_down(key).move_to_element(canvas)
+        actions.click_and_hold().move_by_offset(across, down).release().key_up(key).perform()
+
+    dragged(keys.SHIFT, 40, 60)
+    before = np.array(driver.execute_script("return v.rotation"))
+    assert driver.execute_script("return v.state.tip") == [0, 0, 0] and before[0, 2] != 0
+    dragged(keys.CONTROL, 0, 60)
+    after = np.array(driver.execute_script("return v.rotation"))
+    frame = {name: np.array(axis) for name, axis in driver.execute_script("return v.camera.frame()").items()}
+    further = after @ before.T
+    assert further @ frame["back"] @ frame["up"] == pytest.approx(-np.sin(np.pi * 60 / height), abs=1e-6)
+    assert_allclose(further @ frame["right"], frame["right"], atol=1e-6)
+    dragged(keys.CONTROL, 30, 0)
+    turned = np.array(driver.execute_script("return v.rotation")) @ after.T
+    assert_allclose(turned, turn_matrix(180 * 30 / height), atol=1e-6)
+    webdriver.ActionChains(driver).send_keys(keys.ARROW_UP, "u").perform()
+    assert driver.execute_script("return v.state.tip") == [0, 0, 0]
+    assert driver.execute_script("return v.camera.state") == camera
+
+
+def test_about_another_axis_the_light_stays(page):
+    before = picture(page, "v.set({degrees: 70, tip: [20, 0, 10]})")
+    page.execute_script(
+        "const menu = document.getElementById('panel').elements.axis; menu.value = 'z';"
+        "menu.dispatchEvent(new Event('input', { bubbles: true }))"
+    )
+    assert page.execute_script("return v.state.axis") == "z"
+    assert np.abs(picture(page) - before).max() < 0.02
+    assert np.abs(picture(page, "v.turn(60)") - before).mean() > 0.005
+
+
+def test_colours_say_what_the_matrix_is_made_of(page, exported, artefact):
+    """Each colouring shows what its legend says: colours of its own, those of Python at the vertices.
+
+    Dense vertices are bright dots on dark surfaces; ranks go from dark to bright.
+    """
+    scene, transport, _, _ = exported
+    made, order = colourings(transport), draw_order(scene).order
+    pictures = {"radiance": picture(page)}
+    for name in ("clusters", "rank", "dense"):
+        pictures[name] = picture(page, "v.set({colours: arguments[0]}); v.held = false; v.touch()", name)
+        page.execute_async_script(
+            UNTIL, f"document.getElementById('legend').textContent === {made[name].legend!r}", 5000
+        )
+        assert page.find_element("id", "legend").text == made[name].legend
+        sent = np.array(page.execute_script(f"return Array.from(v.scene.arrays.{name}Colours)")).reshape(
+            -1, 3
+        )
+        assert np.array_equal(sent, made[name].colours[order])
+        page.execute_script("v.held = true")
+    figure, axes = panels(14, 4, 1, 4)
+    for axis, (name, image) in zip(axes, pictures.items(), strict=True):
+        axis.imshow(image)
+        axis.set(title=name)
+    artefact(figure, "colourings")
+    for a, b in itertools.combinations(pictures, 2):
+        assert np.abs(pictures[a] - pictures[b]).mean() > 0.02, (a, b)
+    bright, dark = (
+        (np.abs(pictures["dense"] - np.array(colour) / 255).max(axis=-1) < 0.1).mean()
+        for colour in (DENSE, OTHERS)
+    )
+    assert bright > 0.002 and dark > 0.1, (bright, dark)
+    options = page.find_elements("css selector", "select[name=colours] option")
+    assert all(option.is_enabled() for option in options if option.get_attribute("value") != "error")
+
+
 def test_light_of_the_page_is_the_projection(page):
     for k, (name, light) in enumerate(LIGHTS.items()):
-        for degrees in (0, 77.5):
-            page.execute_script(f"v.set({{environment: {k}, degrees: {degrees}}}); v.relight('everything')")
-            exact = LIGHTING.project(light.rotated(degrees))
-            assert relative_l2(array(page, "texels").reshape(-1, 3), exact) < 0.01, name
+        for how in TURNS:
+            page.execute_script(
+                "v.set({environment: arguments[0], ...arguments[1]}); v.relight('everything')", k, how
+            )
+            exact = LIGHTING.project(light.rotated(turn_matrix(**how)))
+            assert relative_l2(array(page, "texels").reshape(-1, 3), exact) < 0.01, (name, how)
             wavelets = haar_colours(exact, np.sqrt(LIGHTING.solid_angles, dtype=np.float32))
             assert relative_l2(array(page, "light").reshape(-1, 3), wavelets) < 0.01
             assert_allclose(array(page, "light"), array(page, "approximation.applied"))
+
+
+def test_turns_are_those_of_python(page):
+    """Random states: their matrix. And the same light about another axis, or turned further about any direction."""
+    rng, names = np.random.default_rng(4), ["x", "y", "z"]
+    for k in range(12):
+        how = {
+            "degrees": float(rng.uniform(0, 360)),
+            "axis": names[k % 3],
+            "tip": [*map(float, rng.normal(size=3) * 80)],
+        }
+        before = turn_matrix(**how)
+        found = page.execute_script("v.set(arguments[0]); return v.rotation", how)
+        assert_allclose(found, before, atol=1e-9)
+        split = page.execute_script("v.turnAbout(arguments[0]); return v.shown", names[(k + 1) % 3])
+        assert split["axis"] == names[(k + 1) % 3]
+        assert_allclose(turn_matrix(split["degrees"], split["axis"], split["tip"]), before, atol=1e-9)
+        assert abs(split["tip"][(k + 1) % 3]) < 1e-6  # at right angles
+        right = np.array(page.execute_script("return v.camera.frame().right"))
+        page.execute_script("v.turn(17, 23)")
+        further = turn_matrix(17, split["axis"]) @ turn_matrix(0, "y", 23 * right) @ before
+        assert_allclose(page.execute_script("return v.rotation"), further, atol=1e-9)
 
 
 def test_inverse_is_the_inverse(page):
@@ -316,7 +450,10 @@ def test_a_dropped_image_is_used(page, exported, tmp_path):
 
 
 def test_a_link_shows_the_same(page, exported):
-    moved = picture(page, "v.set({environment: 1, degrees: 200, exposure: 0.5}); v.camera.orbit(0.4, 0.1)")
+    moved = picture(
+        page,
+        "v.set({environment: 1, degrees: 200, axis: 'z', tip: [60, -20, 5], exposure: 0.5}); v.camera.orbit(0.4, 0.1)",
+    )
     address = page.execute_script("return '#' + v.address")
     open_page(page, exported[3].as_uri() + address)
     assert np.abs(picture(page) - moved).mean() < 0.002  # five digits of the camera's place

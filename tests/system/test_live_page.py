@@ -19,6 +19,7 @@ from mi_sparse_prt.core.metrics import flip_map
 from mi_sparse_prt.relighting.viewer import make_live_page
 from mi_sparse_prt.relighting.viewer.answers import page_sensor
 from mi_sparse_prt.relighting.viewer.server import PageServer
+from mi_sparse_prt.relighting.viewer.turning import turn_matrix
 
 pytestmark = MARKS
 LIGHTING = prt.CubemapLighting(8)
@@ -167,7 +168,8 @@ def served_image(driver, served, spp: int) -> np.ndarray:
     )
     sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
     answers = served.made.answers
-    light = answers.environments[view["light"]].rotated(view["degrees"])
+    turn = turn_matrix(view["degrees"], view["axis"], view["tip"])
+    light = answers.environments[view["light"]].rotated(turn)
     return prt.render(answers.scene, answers.transport, light, sensor, spp)
 
 
@@ -176,7 +178,9 @@ def served_image(driver, served, spp: int) -> np.ndarray:
 def test_a_picture_by_python_lies_over_the_page(driver, served, by):
     """Right of the line is Python's picture, of the same view and light; it goes when the light moves."""
     settled(driver)
-    driver.execute_script("v.set({degrees: 30, beside: arguments[0], line: 0.25})", by)
+    driver.execute_script(
+        "v.set({degrees: 30, axis: 'z', tip: [70, 0, -20], beside: arguments[0], line: 0.25})", by
+    )
     driver.execute_async_script(UNTIL, "v.beside.passes >= 3 && !v.beside.canvas.hidden", 30000)
     text = driver.execute_script("return v.beside.canvas.toDataURL('image/png')")
     assert driver.execute_script("return v.beside.canvas.style.clipPath").endswith("25%)")
@@ -226,6 +230,20 @@ def test_dropped_images_are_checked_in_python(driver, served, tmp_path):
     assert driver.execute_script("return v.shown.light") == "own.exr"
     ours = settled(driver)
     assert far(ours, served_image(driver, served, 64)) < FLIP
+
+
+@pytest.mark.parametrize("served", ["glossy", "lamps"], indirect=True)
+def test_colours_that_are_not_known_say_so(driver, served):
+    """A matrix that is not compressed, and whose vertices were all sampled alike. Expected: options that say so."""
+    for name, words in (
+        ("clusters", "no clusters"),
+        ("rank", "not compressed"),
+        ("dense", "all were sampled alike"),
+    ):
+        option = driver.find_element("css selector", f"select[name=colours] option[value={name}]")
+        assert not option.is_enabled() and option.get_attribute("textContent").endswith(": not known")
+        assert words in option.get_attribute("title")
+        assert words in driver.find_element("id", "notes").get_attribute("textContent")
 
 
 @pytest.mark.parametrize("served", ["clusters"], indirect=True)
@@ -342,7 +360,7 @@ def notebook(driver, scene, transports, tmp_path):
     sent = []
     viewer.send = lambda content, buffers=(): sent.append((content, [bytes(b) for b in buffers]))
     code = base64.b64encode(str(prt.Viewer._esm).encode()).decode()
-    names = ("page", "height", "light", "degrees", "exposure", "camera", "lamps")
+    names = ("page", "height", "light", "degrees", "axis", "tip", "exposure", "camera", "lamps")
     traits = json.dumps({name: getattr(viewer, name) for name in names}).replace("</", "<\\/")
     path = tmp_path / "notebook.html"
     path.write_text(NOTEBOOK.replace("{code}", code).replace("{traits}", traits))
@@ -377,9 +395,11 @@ def test_a_notebook_has_light_and_camera_as_traits(driver, scene, transports, no
     exchanged(driver, notebook, quiet)
     driver.execute_script("model.set('degrees', 90); model.set('light', 'second')")
     exchanged(driver, notebook, "v.state.degrees === 90 && v.environment.name === 'second' && " + quiet)
-    driver.execute_script("v.camera.orbit(0.3, 0); v.set({degrees: 45})")
-    exchanged(driver, notebook, "model.get('degrees') === 45 && " + quiet)
-    for name in ("degrees", "light", "camera"):
+    driver.execute_script("model.set('tip', [40, 0, 15])")
+    exchanged(driver, notebook, "String(v.state.tip) === '40,0,15' && " + quiet)
+    driver.execute_script("v.camera.orbit(0.3, 0); v.turnAbout('x'); v.set({degrees: 45})")
+    exchanged(driver, notebook, "model.get('degrees') === 45 && model.get('axis') === 'x' && " + quiet)
+    for name in ("degrees", "axis", "tip", "light", "camera"):
         setattr(viewer, name, driver.execute_script("return model.get(arguments[0])", name))
     assert driver.execute_script("return window.saved") >= 1
     driver.execute_script("v.held = v.pinned = true; v.resize(...arguments)", *SIZE)

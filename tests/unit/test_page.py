@@ -10,6 +10,7 @@ import threading
 import time
 import zlib
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import build, still_life
@@ -119,6 +120,14 @@ def test_a_page_has_what_it_plays(coloured_scene, compressed):
     assert_array_equal(found["labels"], compressed.operators["compressed"].labels[order])
     assert found["weights"].shape == (found["channels"] * found["vectors"] * n,)
     assert_same_columns(found, page.clusters)
+
+
+def test_a_page_turns_light_about_what_its_camera_calls_up(coloured_scene, compressed):
+    for up, axis in (([0, 1, 0], "y"), ([0, 0, 1], "z")):
+        towards = mi.ScalarTransform4f().look_at(origin=[3, 3, 3], target=[0, 0, 0], up=up)
+        sensor = mi.load_dict({"type": "perspective", "to_world": towards})
+        page = make_page(coloured_scene, compressed, {"noise": ENVIRONMENT}, kept=0.3, sensor=sensor)
+        assert in_page(page)["axis"] == axis
 
 
 def assert_same_columns(found, clusters):

@@ -19,6 +19,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import SUFFIXES, Environment, load_environment
 from mi_sparse_prt.relighting.image import background_emitter, render
 from mi_sparse_prt.relighting.viewer import page_scene
+from mi_sparse_prt.relighting.viewer.turning import turn_matrix
 from mi_sparse_prt.relighting.viewer.visible_lamps import VisibleLamps
 from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.scene.scene import Scene
@@ -182,7 +183,8 @@ class Answers:
             return np.frombuffer(content, "<f4").reshape(-1, 3)
         number = _whole(question, "environment", 0, len(self.environments))
         chosen = list(self.environments.values())[number]
-        return chosen.rotated(_number(question, "degrees"))
+        tip = _vector({"tip": [0, 0, 0]} | dict(question), "tip").tolist()
+        return chosen.rotated(turn_matrix(_number(question, "degrees"), question.get("axis", "y"), tip))
 
     def _environment(self, question: Question, content: bytes) -> Answer:
         """A dropped image as one more light of the page: its radiance (RGB9_E5), and its background."""

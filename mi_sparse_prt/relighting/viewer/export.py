@@ -19,8 +19,10 @@ from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.relighting.clusters import ClusterColumns, cluster_columns
 from mi_sparse_prt.relighting.viewer import page_scene
 from mi_sparse_prt.relighting.viewer.archive import packed
+from mi_sparse_prt.relighting.viewer.colourings import colourings, in_page
 from mi_sparse_prt.relighting.viewer.page_file import PageFile, page_text
 from mi_sparse_prt.relighting.viewer.truncated_clusters import TruncatedClusters, truncate_clusters
+from mi_sparse_prt.relighting.viewer.turning import axis_up
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 
@@ -28,7 +30,18 @@ KEPT = 0.05  # of the wavelet coefficients of all basis vectors, if not given
 TURNS = 8  # azimuths of each environment, whose wavelets say how large those of light are
 BLACK = 1e-30  # power of an environment that shines at all
 SCRIPTS = (
-    *("archive", "shared", "light", "wavelets", "radiance_file", "camera", "webgl", "picture", "python"),
+    *(
+        "archive",
+        "shared",
+        "light",
+        "wavelets",
+        "radiance_file",
+        "camera",
+        "turning",
+        "webgl",
+        "picture",
+        "python",
+    ),
     "main",
 )
 DIFFERENCES = frozenset({"triangles", "starts", "order", "labels"})  # are kept as such
@@ -97,7 +110,7 @@ def make_page(
     transport = transport.for_scene(scene)
     operator, drawn = _played(transport), page_scene.draw_order(scene)
     played, arrays, header = played_part(operator, environments, kept, drawn.order)
-    shown, about = shown_part(scene, environments, sensor, drawn)
+    shown, about = shown_part(scene, transport, environments, sensor, drawn)
     text = page_text("index", SCRIPTS, title, packed(about | header, shown | arrays, DIFFERENCES))
     return Page(text, played, tuple(about["notes"]))
 
@@ -130,26 +143,26 @@ def played_part(
 
 def shown_part(
     scene: Scene,
+    transport: LightTransport,
     environments: Mapping[str, Environment],
     sensor: int | mi.Sensor | None,
     drawn: page_scene.DrawOrder,
-    glossy: bool = False,
 ) -> tuple[page_scene.Arrays, dict[str, Any]]:
-    """What a page shows whatever it plays: triangles, lights, a camera; as arrays, and what to know of them.
-
-    ``glossy`` says that it shows glossy terms, too.
-    """
+    """What a page shows whatever it plays: triangles, lights, a camera, colourings; as arrays, and words of these."""
     geometry, about = page_scene.geometry(scene, drawn)
     radiance, lights = page_scene.lights(environments)
+    colours, words = in_page(colourings(transport), drawn.order)
     if sensor is None and scene.mitsuba.sensors():
         sensor = 0
+    camera = page_scene.camera(scene, sensor)
     about |= {
-        "camera": page_scene.camera(scene, sensor),
+        "camera": camera,
+        "axis": axis_up(camera["up"]),
         "exposure": 0,
         "environments": lights,
-        "notes": _notes(scene, glossy),
+        "notes": _notes(scene, transport.terms > 0),
     }
-    return geometry | radiance, about
+    return geometry | radiance | colours, about | words
 
 
 def expected_sizes(environments: Mapping[str, Environment], lighting: CubemapLighting) -> Floats:
@@ -216,9 +229,4 @@ def _row_arrays(truncated: TruncatedClusters, order: NDArray[np.int64]) -> dict[
     labels[layout.order] = np.repeat(np.arange(len(layout.starts) - 1), np.diff(layout.starts))
     weights = np.empty_like(truncated.weights)
     weights[:, :, layout.order] = truncated.weights
-    colours = page_scene.cluster_colours(len(layout.starts) - 1)
-    return {
-        "labels": labels[order],
-        "weights": weights[:, :, order],
-        "clusterColours": colours[labels[order]],
-    }
+    return {"labels": labels[order], "weights": weights[:, :, order]}

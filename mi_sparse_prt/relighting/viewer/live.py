@@ -88,7 +88,7 @@ def make_live_page(
     if not lights:
         raise PrtError("a page without light shows nothing: give at least one environment")
     drawn, operator = page_scene.draw_order(scene), transport.operators.get("compressed")
-    arrays, about = shown_part(scene, lights, sensor, drawn, transport.terms > 0)
+    arrays, about = shown_part(scene, transport, lights, sensor, drawn)
     if isinstance(operator, Clustered) and lamps is None and isinstance(transport.reflection, Diffuse):
         _, played, header = played_part(operator, lights, kept, drawn.order)
         arrays |= played

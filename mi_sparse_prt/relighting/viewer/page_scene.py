@@ -23,7 +23,6 @@ SHARPEST = 512  # rows of a background, at most
 QUALITY = 98  # of its JPEG
 TEXTURE = 512  # pixels along an edge of an albedo texture
 PERSPECTIVE = "PerspectiveCamera", "ThinLensCamera"  # sensors that a page can stand for
-GOLDEN = 0.6180339887498949  # colours of neighbouring clusters differ by this part of the circle of hues
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -90,15 +89,6 @@ def geometry(scene: Scene, own: DrawOrder) -> tuple[Arrays, dict[str, Any]]:
         "textures": textures,
     }
     return arrays, about
-
-
-def cluster_colours(count: int) -> NDArray[np.uint8]:
-    """Colours (count, 3) that tell neighbours apart."""
-    from matplotlib.colors import hsv_to_rgb
-
-    numbers = np.arange(count)
-    hues = np.stack([numbers * GOLDEN % 1, 0.45 + 0.3 * (numbers % 2), np.full(count, 0.9)], axis=1)
-    return np.rint(255 * np.asarray(hsv_to_rgb(hues))).astype(np.uint8)
 
 
 def camera(scene: Scene, sensor: int | mi.Sensor | None) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from mi_sparse_prt.emission.environment import Environment, environment_of
 from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.relighting.viewer.answers import page_sensor
 from mi_sparse_prt.relighting.viewer.live import LivePage, make_live_page
+from mi_sparse_prt.relighting.viewer.turning import AXES, axis_up, turn_matrix
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 
@@ -36,7 +37,12 @@ class Viewer(anywidget.AnyWidget):
     light : str
         Name of the environment.
     degrees : float
-        By which it is turned about +y, counter-clockwise seen from above.
+        By which it is turned about ``axis``, counter-clockwise seen from its end.
+    axis : {"x", "y", "z"}
+        Of the world: +y, or +z where that is what the scene's camera calls up.
+    tip : list of 3 float
+        By which it is turned before that: about this direction of the world, by as many degrees as it is long.
+        ``[90, 0, 0]`` stands an environment upright where +z is up.
     exposure : float
         Stops.
     camera : list of 6 float
@@ -51,6 +57,8 @@ class Viewer(anywidget.AnyWidget):
     height = traitlets.Int(HEIGHT).tag(sync=True)
     light = traitlets.Unicode().tag(sync=True)
     degrees = traitlets.Float(0.0).tag(sync=True)
+    axis = traitlets.Enum(tuple(AXES), "y").tag(sync=True)
+    tip = traitlets.List(traitlets.Float(), [0.0, 0.0, 0.0], 3, 3).tag(sync=True)
     exposure = traitlets.Float(0.0).tag(sync=True)
     camera = traitlets.List(traitlets.Float()).tag(sync=True)
     lamps = traitlets.List(traitlets.Float()).tag(sync=True)
@@ -61,6 +69,7 @@ class Viewer(anywidget.AnyWidget):
             page=page.text,
             height=height,
             light=page.lights[0],
+            axis=axis_up(start["up"]),
             camera=[*map(float, start["eye"]), *map(float, start["target"])],
             lamps=[1.0] * len(page.answers.transport.lights),
         )
@@ -98,7 +107,7 @@ class Viewer(anywidget.AnyWidget):
         if answers.transport.lights:
             light: Any = np.asarray(self.lamps, np.float32)
         elif self.light in answers.environments:
-            light = answers.environments[self.light].rotated(self.degrees)
+            light = answers.environments[self.light].rotated(turn_matrix(self.degrees, self.axis, self.tip))
         else:
             raise PrtError(f"there is no light {self.light!r}; there are: {', '.join(answers.environments)}")
         return render(answers.scene, answers.transport, light, sensor, spp)

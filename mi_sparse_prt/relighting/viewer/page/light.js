@@ -1,4 +1,4 @@
-// --- E: an environment that turns about +y, as texels of a cubemap and as Haar wavelets
+// --- E: an environment that turns, as texels of a cubemap and as Haar wavelets
 
 // [face][s axis, t axis, centre], as emission/cube_faces.py
 const FACES = [
@@ -125,7 +125,7 @@ function shrunk({ width, height, values }, rows) {
   return { width: columns, height: rows, values: Float32Array.from(sums, (sum, k) => sum / areas[Math.floor(k / 3)]) };
 }
 
-// Equirectangular radiance (height, width, 3), whose lookups from texels are those of one angle moved along the rows
+// Equirectangular radiance (height, width, 3)
 class Environment {
   constructor(name, width, height, values) {
     Object.assign(this, { name, width, height, values });
@@ -136,10 +136,12 @@ class Environment {
     }
   }
 
-  // Mean radiance of texels (size, 3) of the environment, turned by so many degrees about +y
-  project(cubemap, degrees, result) {
-    const { width, height, values } = this, { azimuths, rows, weights, count } = lookups(cubemap, width);
-    const shift = (((degrees / 360) % 1) + 1) * width, total = [0, 0, 0];
+  // Mean radiance of texels (size, 3) of the environment, turned by a matrix (three rows, world from environment)
+  project(cubemap, matrix, result) {
+    const { width, height, values } = this, known = lookups(cubemap, width), { weights, count } = known;
+    const upright = matrix[1][1] > 1 - 1e-9; // about +y: lookups keep their rows, and move along these
+    const { azimuths, rows } = upright ? known : turnedLookups(known, matrix);
+    const shift = upright ? (Math.atan2(matrix[0][2], matrix[0][0]) / (2 * Math.PI) + 1) * width : 0, total = [0, 0, 0];
     for (let j = 0; j < cubemap.size; j++) {
       let red = 0, green = 0, blue = 0;
       for (let k = j * count; k < (j + 1) * count; k++) {
@@ -169,7 +171,7 @@ class Environment {
 function lookups(cubemap, width) {
   const { n, size } = cubemap, across = Math.max(LEAST_LOOKUPS, Math.round(width / (4 * n))), count = across * across;
   if (cubemap.lookups && cubemap.lookups.count === count) return cubemap.lookups;
-  const azimuths = new Float32Array(size * count), rows = new Float32Array(size * count), weights = new Float32Array(size * count);
+  const [azimuths, rows, weights] = [0, 1, 2].map(() => new Float32Array(size * count)), directions = new Float32Array(3 * size * count);
   for (let j = 0; j < size; j++) {
     const [sAxis, tAxis, centre] = FACES[Math.floor(j / (n * n))];
     let whole = 0;
@@ -177,11 +179,33 @@ function lookups(cubemap, width) {
       const s = (2 * ((j % n) + ((k % across) + 0.5) / across)) / n - 1;
       const t = (2 * ((Math.floor(j / n) % n) + (Math.floor(k / across) + 0.5) / across)) / n - 1;
       const [x, y, z] = centre.map((c, axis) => c + s * sAxis[axis] + t * tAxis[axis]);
+      directions.set([x, y, z], 3 * (j * count + k));
       azimuths[j * count + k] = (Math.atan2(x, -z) / (2 * Math.PI) + 1) % 1;
       rows[j * count + k] = Math.acos(y / Math.hypot(x, y, z)) / Math.PI;
       whole += weights[j * count + k] = (1 + s * s + t * t) ** -1.5;
     }
     for (let k = 0; k < count; k++) weights[j * count + k] /= whole;
   }
-  return (cubemap.lookups = { azimuths, rows, weights, count });
+  return (cubemap.lookups = { azimuths, rows, weights, count, directions, turned: [azimuths.slice(), rows.slice()] });
+}
+
+// Azimuth (from 0.5 on) and height of these places in an environment that is turned by a matrix, world from environment
+function turnedLookups({ directions, turned }, [[a, b, c], [d, e, f], [g, h, i]]) {
+  const [azimuths, rows] = turned;
+  for (let k = 0; k < rows.length; k++) {
+    const x = directions[3 * k], y = directions[3 * k + 1], z = directions[3 * k + 2];
+    const right = a * x + d * y + g * z, up = b * x + e * y + h * z, behind = c * x + f * y + i * z;
+    azimuths[k] = angle(right, -behind) / (2 * Math.PI) + 1;
+    rows[k] = angle(Math.sqrt(right * right + behind * behind), up) / Math.PI;
+  }
+  return { azimuths, rows };
+}
+
+// Math.atan2 to within 1e-5, a thousandth of a pixel (Abramowitz and Stegun 4.4.49), in a part of its time
+function angle(y, x) {
+  const p = Math.abs(x), q = Math.abs(y), r = Math.min(p, q) / Math.max(p, q, 1e-30), s = r * r;
+  let found = r * (0.999866 + s * (-0.3302995 + s * (0.180141 + s * (-0.085133 + s * 0.0208351))));
+  if (q > p) found = Math.PI / 2 - found;
+  if (x < 0) found = Math.PI - found;
+  return y < 0 ? -found : found;
 }

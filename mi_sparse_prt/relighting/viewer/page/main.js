@@ -3,7 +3,6 @@
 const STILL = 150; // milliseconds after which nothing moves any more
 const PICTURES = 100; // between pictures of the light, while it moves
 const HEIGHT = 128; // pixels of an image that is dropped; larger ones become smaller
-const KINDS = { radiance: 0, light: 1, clusters: 2, error: 3 };
 const CLICK = 3; // pixels that a click may move
 
 class Viewer {
@@ -24,7 +23,7 @@ class Viewer {
     this.texels = new Float32Array(3 * this.cubemap.size);
     this.light = new Float32Array(3 * this.cubemap.size);
     this.state = {
-      environment: 0, degrees: 0, exposure: scene.exposure, method: "per_band", budget: 100, colours: "radiance",
+      environment: 0, ...UPRIGHT, axis: scene.axis || "y", exposure: scene.exposure, method: "per_band", budget: 100, colours: "radiance",
       beside: "", line: 0.5, lamps: (scene.lamps || []).map(() => 1),
     };
     this.milliseconds = {};
@@ -55,9 +54,24 @@ class Viewer {
     const before = { ...this.state };
     Object.assign(this.state, changes);
     this.state.degrees = ((this.state.degrees % 360) + 360) % 360;
-    if (before.environment !== this.state.environment || before.degrees !== this.state.degrees) this.changed = true;
-    if (changes.lamps) this.changed = true;
+    if (["environment", "degrees", "axis", "tip", "lamps"].some((name) => String(before[name]) !== String(this.state[name]))) this.changed = true;
     this.touch();
+  }
+
+  // How the light is turned: three rows, world from environment
+  get rotation() {
+    return matrixOf(turnOf(this.state));
+  }
+
+  // From now on about another axis; the light stays as it is
+  turnAbout(axis) {
+    this.set(splitTurn(turnOf(this.state), axis));
+  }
+
+  // Turn the light further: by degrees about up, and tip it about what is horizontal in the picture
+  turn(across, down = 0) {
+    const how = down ? turnedFurther(this.state, this.camera.frame().right, down) : this.state;
+    this.set({ ...how, degrees: how.degrees + across });
   }
 
   touch() {
@@ -69,7 +83,7 @@ class Viewer {
   relight(method = this.started ? this.state.method : "everything") {
     if (this.state.lamps.length) return this.relightLamps();
     const times = [performance.now()], lap = () => times.push(performance.now());
-    this.environment.project(this.cubemap, this.state.degrees, this.texels);
+    this.environment.project(this.cubemap, this.rotation, this.texels);
     this.cubemap.haar(this.texels, this.light);
     lap();
     const chosen = this.approximation.update(this.light, method, this.state.budget);
@@ -102,7 +116,7 @@ class Viewer {
   get drawn() {
     const { state, camera, environment } = this;
     return {
-      camera, light: environment, degrees: state.degrees, exposure: 2 ** state.exposure, kind: KINDS[state.colours],
+      camera, light: environment, turn: this.rotation, exposure: 2 ** state.exposure, colours: state.colours,
       brightness: state.lamps[this.scene.backgroundLamp] ?? 1,
     };
   }
@@ -142,22 +156,23 @@ class Viewer {
 
   // What is shown, as others may set it: light by its name, camera as six numbers
   get shown() {
-    const { environment, degrees, exposure, lamps } = this.state, { eye, target } = this.camera;
-    return { light: this.environments[environment].name, degrees, exposure, camera: [...eye, ...target], lamps };
+    const { environment, degrees, axis, tip, exposure, lamps } = this.state, { eye, target } = this.camera;
+    return { light: this.environments[environment].name, degrees, axis, tip, exposure, camera: [...eye, ...target], lamps };
   }
 
-  apply({ light, degrees, exposure, camera, lamps }) {
+  apply({ light, degrees, axis, tip, exposure, camera, lamps }) {
     const environment = this.environments.findIndex(({ name }) => name === light);
-    const changes = environment < 0 ? { degrees, exposure } : { environment, degrees, exposure };
+    const changes = { degrees, axis, tip: [...tip], exposure, ...(environment < 0 ? {} : { environment }) };
     if (String(lamps) !== String(this.state.lamps) && lamps.length === this.state.lamps.length) changes.lamps = [...lamps];
     if (camera.length === 6) [this.camera.eye, this.camera.target] = [camera.slice(0, 3), camera.slice(3)];
     this.set(changes);
   }
 
   get address() {
-    const { environment, degrees, exposure } = this.state;
+    const { environment, degrees, axis, tip, exposure } = this.state;
     return new URLSearchParams({
-      light: this.environments[environment].name, degrees: +degrees.toFixed(2), exposure: +exposure.toFixed(2), camera: this.camera.state,
+      light: this.environments[environment].name, degrees: +degrees.toFixed(2), axis, tip: tip.map((value) => +value.toFixed(2)).join(","),
+      exposure: +exposure.toFixed(2), camera: this.camera.state,
     }).toString();
   }
 
@@ -169,6 +184,9 @@ class Viewer {
       const value = parseFloat(given.get(name));
       if (Number.isFinite(value)) changes[name] = value;
     }
+    if (Object.hasOwn(AXES, given.get("axis"))) changes.axis = given.get("axis");
+    const tip = (given.get("tip") || "").split(",").map(parseFloat);
+    if (tip.length === 3 && tip.every(Number.isFinite)) changes.tip = tip;
     if (given.has("camera")) this.camera.state = given.get("camera");
     this.set(changes);
   }
@@ -197,7 +215,8 @@ function panel(viewer) {
   const show = () => {
     const { state } = viewer;
     if (elements.environment.length !== viewer.environments.length) list();
-    for (const name of ["environment", "degrees", "exposure", "method", "colours", "beside", "line"]) elements[name].value = state[name];
+    for (const name of ["environment", "degrees", "axis", "exposure", "method", "colours", "beside", "line"]) elements[name].value = state[name];
+    document.getElementById("legend").textContent = (viewer.scene.legends || {})[state.colours] || "";
     state.lamps.forEach((value, k) => (elements[`lamp${k}`].value = value));
     elements.budget.value = Math.log2(state.budget);
     elements.record.textContent = viewer.recorder.recording ? "stop film" : "film";
@@ -208,6 +227,7 @@ function panel(viewer) {
       const lamps = viewer.state.lamps.map((_, k) => +elements[`lamp${k}`].value);
       return viewer.set({ lamps });
     }
+    if (target.name === "axis") return viewer.turnAbout(target.value);
     const value = target.name === "budget" ? Math.round(2 ** target.value) : target.value;
     viewer.set({ [target.name]: ["method", "colours", "beside"].includes(target.name) ? value : +value });
   });
@@ -234,12 +254,16 @@ function panel(viewer) {
 function forThisMatrix(viewer, form) {
   const { scene } = viewer, { elements } = form, hide = (element) => (element.hidden = true);
   document.getElementById("asked").hidden = !scene.live;
-  if (scene.streamed) hide(elements.colours.querySelector('[value="clusters"]'));
+  for (const name of OF_VERTICES) {
+    if (scene.arrays[name + "Colours"]) continue;
+    const option = elements.colours.querySelector(`[value="${name}"]`);
+    Object.assign(option, { disabled: true, textContent: `${option.textContent}: not known`, title: (scene.unknown || {})[name] || "" });
+  }
   const errors = Object.entries(scene.errors || {});
   if (!errors.length) hide(elements.colours.querySelector('[value="error"]'));
   elements.colours.title = errors.map(([name, { error }]) => `${name}: ${(100 * error).toFixed(1)}%`).join("\n");
   if (!scene.lamps || !scene.lamps.length) return;
-  for (const name of ["environment", "degrees", "method", "budget"]) hide(elements[name].parentElement);
+  for (const name of ["environment", "degrees", "axis", "method", "budget"]) hide(elements[name].parentElement);
   form.querySelectorAll(".pictures").forEach(hide);
   hide(elements.play);
   hide(document.getElementById("vertex"));
@@ -277,7 +301,8 @@ function pointers(viewer, canvas) {
       if (spread) viewer.camera.dolly(spread / next);
       spread = next;
       viewer.touch();
-    } else if (event.shiftKey || before.buttons & 2) viewer.set({ degrees: viewer.state.degrees + 180 * across });
+    } else if (event.ctrlKey || event.metaKey) viewer.turn(180 * across, 180 * down);
+    else if (event.shiftKey || before.buttons & 2) viewer.turn(180 * across);
     else {
       viewer.camera.orbit(Math.PI * across, Math.PI * down);
       viewer.touch();
@@ -340,13 +365,17 @@ function actions(viewer, form) {
     help: () => (keys.open ? keys.close() : keys.showModal()),
     panel: () => (form.hidden = !form.hidden),
     next: () => viewer.set({ environment: (viewer.state.environment + 1) % viewer.environments.length }),
-    left: () => viewer.set({ degrees: viewer.state.degrees - 1 }),
-    right: () => viewer.set({ degrees: viewer.state.degrees + 1 }),
+    left: () => viewer.turn(-1),
+    right: () => viewer.turn(1),
+    up: () => viewer.turn(0, -1),
+    down: () => viewer.turn(0, 1),
+    upright: () => viewer.set({ tip: UPRIGHT.tip }),
     brighter: () => viewer.set({ exposure: viewer.state.exposure + 0.25 }),
     darker: () => viewer.set({ exposure: viewer.state.exposure - 0.25 }),
   };
   const byKey = {
     " ": "play", s: "screenshot", r: "record", h: "home", "?": "help", p: "panel", n: "next", ArrowLeft: "left", ArrowRight: "right",
+    ArrowUp: "up", ArrowDown: "down", u: "upright",
     "+": "brighter", "=": "brighter", "-": "darker",
   };
   const act = (name) => {
@@ -368,7 +397,7 @@ async function openPage() {
   scene.images = await Promise.all(scene.textures.map(decodedImage));
   await Promise.all(scene.environments.map(async (light) => (light.image = await decodedImage(light.background))));
   const viewer = new Viewer(scene, new Picture(canvas, scene));
-  document.getElementById("notes").textContent = scene.notes.join(" ");
+  document.getElementById("notes").textContent = [...scene.notes, ...Object.values(scene.unknown || {})].join(" ");
   viewer.address = location.hash.slice(1);
   viewer.recorder = new Recorder(viewer);
   const { form, show, pictures } = panel(viewer);
@@ -402,7 +431,7 @@ function run(viewer, canvas, show, pictures) {
   const step = (now) => {
     asked = false;
     if (viewer.held) return; // frames are made by whoever holds it
-    if (viewer.playing) viewer.set({ degrees: viewer.state.degrees + Math.min(now - last, 100) * 0.03 });
+    if (viewer.playing) viewer.turn(Math.min(now - last, 100) * 0.03);
     const scale = window.devicePixelRatio || 1, width = Math.round(canvas.clientWidth * scale), height = Math.round(canvas.clientHeight * scale);
     if (!viewer.pinned && (canvas.width !== width || canvas.height !== height)) viewer.resize(width, height);
     const more = viewer.picture.gl.isContextLost() ? false : viewer.frame(performance.now());

@@ -1,6 +1,8 @@
 // --- pictures by WebGL 2: colours of vertices once per light, then triangles and the background
 
 const ROW = 1024; // vertices in a row of a texture
+const OF_VERTICES = ["clusters", "rank", "dense"]; // colourings, where the archive has them
+const KINDS = { radiance: 0, light: 1, clusters: 2, rank: 2, dense: 2, error: 3 }; // as the shader tells them apart
 
 // irradiance / pi of vertices: clustered PCA's second step, a pixel for each vertex
 const COLOURS = `
@@ -93,12 +95,13 @@ uniform usampler2D seen, triangles;
 uniform sampler2D light, shine, environment, sharp;
 uniform int kind, sharper;
 uniform mat3 towards; // from places of the picture to the frame of the world
-uniform float degrees, brightness;
+uniform mat3 turn; // from there to that of the environment
+uniform float brightness;
 in vec2 place;
 out vec4 colour;
 vec3 background() {
-  vec3 d = normalize(towards * vec3(place, 1.0));
-  vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307 + degrees / 360.0, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
+  vec3 d = turn * normalize(towards * vec3(place, 1.0));
+  vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
   vec3 radiance = sharper == 1 ? textureLod(sharp, uv, 0.0).rgb : vec3(1.0);
   if (max(radiance.r, max(radiance.g, radiance.b)) > 0.98) { // too bright for an image of 8 bits, or there is none
     vec3 blurred = textureLod(environment, uv, 0.0).rgb;
@@ -221,10 +224,12 @@ class Picture extends Drawing {
     };
     this.triangles = three(gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, corners);
     this.vertices = this.texture(gl.RGBA32UI, ROW, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, vertexWords(arrays, ROW * rows));
-    this.clusterColours = arrays.clusterColours ? three(gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, arrays.clusterColours) : this.light;
+    this.colourings = {};
+    for (const name of OF_VERTICES)
+      if (arrays[name + "Colours"]) this.colourings[name] = three(gl.SRGB8, gl.RGB, gl.UNSIGNED_BYTE, arrays[name + "Colours"]);
     if (arrays.texcoords) this.texcoords = this.texture(gl.RG32F, ROW, rows, gl.RG, gl.FLOAT, padded(arrays.texcoords, 2 * ROW * rows));
     const errors = scene.meshes.flatMap(({ name }) => (scene.errors && scene.errors[name] ? scene.errors[name].colour : [0.2, 0.2, 0.2]));
-    this.errors = three(gl.RGB32F, gl.RGB, gl.FLOAT, Float32Array.from(errors));
+    this.colourings.error = three(gl.RGB32F, gl.RGB, gl.FLOAT, Float32Array.from(errors));
   }
 
   // Textures of an environment, made when it is seen first: radiance, and a sharper image if it has one
@@ -291,7 +296,7 @@ class Picture extends Drawing {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }
 
-  drawSample({ camera, light, degrees, exposure, brightness, kind }, sample, framebuffer = null, share = 1) {
+  drawSample({ camera, light, turn, exposure, brightness, colours }, sample, framebuffer = null, share = 1) {
     const { gl, canvas, scene } = this, { width, height } = canvas;
     const view = camera.matrices(width / height, SAMPLES[sample].map((x, axis) => (2 * x) / [width, height][axis]));
     this.see(view, width, height);
@@ -302,14 +307,14 @@ class Picture extends Drawing {
     gl.useProgram(program);
     this.bind(0, gl.TEXTURE_2D, this.view.texture, uniforms.seen);
     this.bind(1, gl.TEXTURE_2D, this.triangles, uniforms.triangles);
-    this.bind(2, gl.TEXTURE_2D, [this.light, this.light, this.clusterColours, this.errors][kind], uniforms.light);
+    this.bind(2, gl.TEXTURE_2D, this.colourings[colours] || this.light, uniforms.light);
     this.bind(3, gl.TEXTURE_2D, radiance, uniforms.environment);
     this.bind(4, gl.TEXTURE_2D, image || radiance, uniforms.sharp);
     if (scene.shines) this.bind(5, gl.TEXTURE_2D, this.shine, uniforms.shine);
     gl.uniform1i(uniforms.sharper, image ? 1 : 0);
-    gl.uniform1i(uniforms.kind, kind);
+    gl.uniform1i(uniforms.kind, KINDS[colours]);
     gl.uniformMatrix3fv(uniforms.towards, false, view.towards);
-    gl.uniform1f(uniforms.degrees, degrees);
+    gl.uniformMatrix3fv(uniforms.turn, false, turn.flat()); // its rows as columns: back to the environment
     gl.uniform1f(uniforms.brightness, brightness);
     gl.uniform1f(uniforms.exposure, exposure);
     gl.bindVertexArray(this.nothing);

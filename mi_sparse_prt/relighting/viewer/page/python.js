@@ -87,7 +87,7 @@ class Beside {
     const scale = Math.min(1, Math.sqrt(LARGEST_PICTURE / (width * height)));
     const [columns, rows] = [width, height].map((pixels) => Math.max(1, Math.round(pixels * scale)));
     return {
-      ask: "picture", by: state.beside, environment: viewer.environment.number, degrees: state.degrees,
+      ask: "picture", by: state.beside, environment: viewer.environment.number, degrees: state.degrees, axis: state.axis, tip: state.tip,
       eye: camera.eye, target: camera.target, up: camera.up, height: camera.height, columns, rows, lamps: state.lamps,
     };
   }

@@ -1,6 +1,6 @@
 // A viewer in a notebook: the page in a frame, and its questions over the kernel's own channel
 
-const STATE = ["light", "degrees", "exposure", "camera", "lamps"];
+const STATE = ["light", "degrees", "axis", "tip", "exposure", "camera", "lamps"];
 
 export default {
   async render({ model, el }) {
