@@ -74,16 +74,15 @@ class LampLitIntegrator(RelitIntegrator):
         active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         u, v = sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
         sample, weight = si.bsdf().sample(smooth, si, u, v, active)
-        limit = dr.opaque(mi.UInt32, self._max_depth if self._max_depth >= 0 else 1 << 31)
 
         def emitted(ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
             met = self._scene.ray_intersect(ray, active)
-            lit = active & (way.depth > 0) & (depth + way.depth < limit)
+            lit = active & (way.depth > depth)
             radiance = met.emitter(self._scene, lit).eval(met, lit)
             return Seen(dr.select(lit, radiance, 0), met, mi.Mask(False))
 
         ray = si.spawn_ray(si.to_world(sample.wo))
-        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth)
+        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth, depth)
         return dr.select(active, weight * found, 0)
 
 
