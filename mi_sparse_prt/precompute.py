@@ -6,7 +6,7 @@ import math
 import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -498,17 +498,24 @@ def _account(parts: MethodResult, problem: Problem, skipped: list[str]) -> dict[
     }
 
 
+class GlossyOptions(TypedDict, total=False):
+    """What ``precompute_glossy`` hands on to ``precompute`` as it is; defaults are there."""
+
+    max_depth: int
+    seed: int
+    progress: bool
+
+
 def precompute_glossy(
     scene: Scene,
     lighting: CubemapLighting,
     terms: int = 4,
     harmonics: int | None = None,
     direct: str = "exact",
-    max_depth: int = 5,
+    *,
     rays: int = 64,
     tolerance: float = 0.06,
-    seed: int = 0,
-    progress: bool = True,
+    **options: Unpack[GlossyOptions],
 ) -> LightTransport:
     """``precompute`` with in-out factors of glossy BRDFs, by one plan: visibility once for all terms, finite elements.
 
@@ -521,13 +528,12 @@ def precompute_glossy(
         As for ``precompute``.
     direct : {"exact", "consensus"}
         How visibility is found, once for all terms.
-    max_depth : int
     rays : int
         Per vertex, that gather indirect light; a power of two.
     tolerance : float
         Relative L2 error that a low rank may cost the first bounce; at least as much as the rays have noise.
-    seed : int
-    progress : bool
+    **options
+        ``max_depth`` (5), ``seed`` (0) and ``progress`` (true), as for ``precompute``.
 
     Raises
     ------
@@ -538,13 +544,5 @@ def precompute_glossy(
         raise PrtError(f"terms must be at least 1, not {terms}")
     if direct not in ("exact", "consensus"):
         raise PrtError(f"direct {direct!r} is neither 'exact' nor 'consensus'")
-    return precompute(
-        scene,
-        lighting,
-        Plan(direct, "gather", rays, tolerance),
-        max_depth=max_depth,
-        seed=seed,
-        progress=progress,
-        terms=terms,
-        harmonics=harmonics,
-    )
+    plan = Plan(direct, "gather", rays, tolerance)
+    return precompute(scene, lighting, plan, terms=terms, harmonics=harmonics, **options)

@@ -80,6 +80,11 @@ def diffuse(*rgb: float) -> dict:
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
 
 
+PALE = diffuse(0.8, 0.8, 0.8)
+GROUND = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": PALE}
+BALL = {"type": "sphere", "center": [0.0, 0.4, 0.0], "radius": 0.4, "bsdf": PALE}  # stands on it
+
+
 def mesh(name: str, vertices: np.ndarray, triangles: np.ndarray, bsdf: dict, smooth: bool = True) -> mi.Mesh:
     """A Mitsuba mesh of these vertices (n, 3) and triangles (m, 3), with normals that Mitsuba makes if ``smooth``."""
     properties = mi.Properties()

@@ -121,10 +121,7 @@ def many_lights(
     A forecast comes first, its own estimate of its error last. In place of --rows and --columns:
     --seconds 10 for all that fits into them, --error 0.02 for as much as it takes.
     """
-    if output.suffix.lower() not in (".exr", ".png"):
-        raise typer.BadParameter(f"{output}: give a name that ends in .exr or .png", param_hint="-o")
-    if groups and output.suffix.lower() == ".png":
-        raise typer.BadParameter("layers need an .exr file: give -o FILE.exr", param_hint="--groups")
+    _check_output(output, groups)
     with running(json_file, quiet, outputs=[output]) as command:
         from mi_sparse_prt.cli.files import image_bytes
         from mi_sparse_prt.cli.tables.many_lights import many_lights_table
@@ -162,3 +159,11 @@ def many_lights(
             write(found.image)
         command.report = {"scene": str(scene), "image": str(output), **found.report}
         command.show(many_lights_table(str(scene), found.report))
+
+
+def _check_output(output: Path, groups: bool) -> None:
+    """Refuse a name of a file that no image can be written to, or not all of its layers (typer.BadParameter)."""
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise typer.BadParameter(f"{output}: give a name that ends in .exr or .png", param_hint="-o")
+    if groups and output.suffix.lower() == ".png":
+        raise typer.BadParameter("layers need an .exr file: give -o FILE.exr", param_hint="--groups")

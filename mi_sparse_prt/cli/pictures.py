@@ -21,7 +21,6 @@ def pictures(
     output: OutputFolder,
     resolution: options.Resolution = options.DEFAULT_RESOLUTION,
     edge_length: options.EdgeLength = None,
-    define: options.Define = None,
     variant: options.Variant = None,
     json_file: options.JsonFile = None,
     quiet: options.Quiet = False,
@@ -37,7 +36,7 @@ def pictures(
 
         check_folder(output)
         for path in scenes:
-            scene = prt.load_scene(path, edge_length, **options.definitions(define))
+            scene = prt.load_scene(path, edge_length)
             with command.prompt_interrupts():
                 figures = benchmarks.draw_gallery(scene, prt.CubemapLighting(resolution), progress=not quiet)
             command.written += benchmarks.save_gallery(figures, output, path.stem)

@@ -80,6 +80,7 @@ def follow(
     sampler: mi.Sampler,
     active: mi.Mask,
     max_depth: int,
+    before: mi.UInt32 | int = 0,
 ) -> tuple[mi.Color3f, mi.Mask]:
     """The radiance of what rays see that go on from surfaces, and whether they meet more than they pass straight on.
 
@@ -91,10 +92,12 @@ def follow(
     active : Mask
     max_depth : int
         Surfaces and the light after them, as for ``path``.
+    before : UInt32
+        Surfaces that count already.
     """
     ray, active = mi.Ray3f(ray), mi.Mask(active)
     total, throughput, density = mi.Color3f(0), mi.Color3f(1), mi.Float(0)
-    depth, valid = mi.UInt32(0), mi.Mask(False)
+    depth, valid = mi.UInt32(before), mi.Mask(False)
     limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
     active &= depth < limit
     while active:

@@ -83,7 +83,7 @@ class RelitScene:
         self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
         self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
-        self.goes_on = scene.specular or bool(followed)
+        self.goes_on, self.rough_glass = scene.specular or bool(followed), scene.rough_glass
         self._light = [_of_depths(irradiance)]  # irradiance / pi; coefficients of terms follow
         self._deepest, self._n_vertices = len(irradiance) - 1, scene.n_vertices
         self._albedo = mi.Color3f(np.ascontiguousarray(scene.albedo.T))

@@ -42,7 +42,9 @@ class LampLitIntegrator(RelitIntegrator):
         self._direct = mi.load_dict({"type": "path", "max_depth": 2})
         self._followed, self._max_depth = relit[-1].followed, max_depth
         self._goes_on = has_mirrors(scene) or bool(self._followed)
-        self._caustics = has_mirrors(scene) and any(shape.is_emitter() for shape in scene.shapes())
+        self._rough_glass = relit[-1].rough_glass
+        met = has_mirrors(scene) and any(shape.is_emitter() for shape in scene.shapes())
+        self._caustics = met or bool(self._rough_glass)
 
     def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         value, valid = super()._radiance(ray, sampler, active)
@@ -68,22 +70,31 @@ class LampLitIntegrator(RelitIntegrator):
     def _by_mirrors(
         self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
     ) -> mi.Color3f:
-        """What surfaces reflect of lamps whose light came by mirrors and glass; ``depth`` surfaces count already."""
+        """What surfaces reflect of lamps whose light came by mirrors and glass; ``depth`` surfaces count already.
+
+        Of points and suns, which rays cannot meet, what leaves rough glass, by a shadow ray there.
+        """
         smooth = mi.BSDFContext()
         smooth.type_mask = int(mi.BSDFFlags.Smooth)  # single directions are followed anyway
         active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         u, v = sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
         sample, weight = si.bsdf().sample(smooth, si, u, v, active)
-        limit = dr.opaque(mi.UInt32, self._max_depth if self._max_depth >= 0 else 1 << 31)
 
         def emitted(ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
             met = self._scene.ray_intersect(ray, active)
-            lit = active & (way.depth > 0) & (depth + way.depth < limit)
-            radiance = met.emitter(self._scene, lit).eval(met, lit)
-            return Seen(dr.select(lit, radiance, 0), met, mi.Mask(False))
+            lit = active & (way.depth > depth)
+            radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
+            if not self._rough_glass:
+                return Seen(radiance, met, mi.Mask(False))
+            rough = active & is_one_of(self._rough_glass, met)
+            asked = rough & ~way.last
+            there, light = self._scene.sample_emitter_direction(met, sampler.next_2d(asked), True, asked)
+            asked &= there.delta
+            value = met.bsdf().eval(mi.BSDFContext(), met, met.to_local(there.d), asked)
+            return Seen(radiance + dr.select(asked, value * light, 0), met, rough)
 
         ray = si.spawn_ray(si.to_world(sample.wo))
-        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth)
+        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth, depth)
         return dr.select(active, weight * found, 0)
 
 

@@ -149,6 +149,26 @@ def lamp_met(problem: Problem, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Int32
     return problem.emission.element_of(si, world, active)
 
 
+def lamp_asked(
+    problem: Problem, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
+) -> tuple[mi.UInt32, mi.Vector3f, mi.Color3f]:
+    """A lamp at random that no ray can meet, a point or a sun, asked by a shadow ray from surfaces (normalised frame).
+
+    Its column, the direction, and its irradiance at right angles to that, as if it was all of them; 0 where it is
+    hidden, or is a lamp that rays meet.
+    """
+    lamps, scene = problem.emission, problem.scene
+    chosen = mi.UInt32(rng.next_float32() * lamps.size)
+    lamp = dr.minimum(chosen, dr.opaque(mi.UInt32, lamps.size - 1))
+    uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+    towards, irradiance, distance = lamps.sample(lamp, to_world(scene, si.p), uv)
+    lit = active & ~scene.normalised.ray_test(
+        si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active
+    )
+    met, _ = lamp_met(problem, si.spawn_ray(towards), lit)
+    return lamp, towards, dr.select(lit & (met != mi.Int32(lamp)), irradiance * lamps.size, 0)
+
+
 def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:
     """Points of the normalised frame in world space."""
     return p / scene.scale + mi.Point3f(*map(float, scene.centre))

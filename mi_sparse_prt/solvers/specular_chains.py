@@ -24,7 +24,7 @@ from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
-from mi_sparse_prt.solvers.lamps import lamp_met
+from mi_sparse_prt.solvers.lamps import lamp_asked, lamp_met
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
@@ -248,7 +248,10 @@ class SpecularChains:
         return mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) | is_one_of(self._rough_glass, si)
 
     def _follow(self, ray: mi.Ray3f, of: mi.UInt32, rng: mi.PCG32, to_light: bool) -> Iterator[_Ends]:
-        """Rays that end after one specular surface, after two, ...: at texels of the sky, at lamps, or at vertices."""
+        """Rays that end after one specular surface, after two, ...: at texels of the sky, at lamps, or at vertices.
+
+        Of lamps, those that are asked at a surface come apart, before those that rays meet after it.
+        """
         hit, met = self._specular_hits(ray)
         dr.eval(hit, met, ray, of, rng)
         index = dr.compress(met)  # few of them
@@ -259,6 +262,8 @@ class SpecularChains:
                 return
             si = hit.compute_surface_interaction(ray, active=hit.is_valid())
             goes_on = hit.is_valid() & self._is_specular(si) & (dr.max(weight) > 0)
+            if to_light and self._rough_glass and not self._of_sky:
+                yield self._of_lamps_asked(si, of, weight, rng, goes_on)
             scattered, share = self._scattered(si, rng, goes_on)
             weight = dr.select(goes_on, weight * share, 0)
             straight &= mi.has_flag(scattered.sampled_type, mi.BSDFFlags.Null)
@@ -278,6 +283,17 @@ class SpecularChains:
             of, weight, straight, ray, rng, hit = (
                 dr.gather(type(x), x, index) for x in (of, weight, straight, ray, rng, hit)
             )
+
+    def _of_lamps_asked(
+        self, si: mi.SurfaceInteraction3f, of: mi.UInt32, weight: mi.Color3f, rng: mi.PCG32, active: mi.Mask
+    ) -> _Ends:
+        """What rough glass scatters of lamps that no ray can meet; the others end the rays that go on from it."""
+        rough = active & is_one_of(self._rough_glass, si)
+        lamp, towards, light = lamp_asked(self._problem, si, rng, rough)
+        brought = weight * si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), rough) * light
+        valid = rough & (dr.max(brought) > 0)
+        dr.eval(of, lamp, brought, valid, rng)
+        return _Ends(of, lamp, brought, valid)
 
     def _light_met(
         self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Mask

@@ -23,8 +23,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
 
 LIGHTING = prt.CubemapLighting(4)
 TERMS, SEEDS = 2, range(32)
-EFFORT = Effort(spp=64)  # their noise is taken out, whatever it is
-LESS_EFFORT = Effort(spp=24)  # where what is judged has errors of more than 5%
+MOST = 4096  # elements of a mesh: a sixteenth of those of the ground would spread too much to see a bias of a tenth
+EFFORT = Effort(spp=64, fewest_paths=MOST)  # their noise is taken out, whatever it is
+LESS_EFFORT = Effort(spp=24, fewest_paths=MOST)  # where what is judged has errors of more than 5%
 Doubles = NDArray[np.float64]
 
 
@@ -113,15 +114,15 @@ def estimates(report: dict) -> dict[str, float]:
 def check(reports: list[dict], true: dict[str, float]) -> None:
     """Without bias: mean squares within three standard errors of their mean, and 2% for what the truth has of its own.
 
-    The spread of 32 seeds is small enough to see a bias of a tenth, but for the ground, which has 81 of the vertices;
-    reported intervals hold the truth.
+    The spread of 32 seeds is small enough to see a bias of a tenth, or of a seventh on the ground, which has 81 of the
+    vertices; reported intervals hold the truth.
     """
     for name, error in true.items():
         squares = np.array([estimates(report)[name] for report in reports]) ** 2
         spread = squares.std(ddof=1) / np.sqrt(len(squares))
         print(f"{name}: {np.sqrt(squares.mean()):.4f}, true {error:.4f}, spread {squares.std():.2e}")
         assert abs(squares.mean() - error**2) < 3 * spread + 0.02 * error**2
-        assert 3 * spread < 0.2 * error**2 or name == "ground"  # whose elements are few
+        assert 3 * spread < (0.3 if name == "ground" else 0.2) * error**2
     widths = np.array([report["standard_error"]["total"] for report in reports])
     away = np.array([report["total"] for report in reports]) - true["total"]
     assert (np.abs(away) < 2 * widths).mean() >= 0.85
@@ -137,10 +138,10 @@ def test_radiance_and_terms(colour):
     """Rationale: elements that no ray of the matrix found tell how far it is off: radiance, squares averaged over views
     by their cosine, and each term by itself.
 
-    A gathered matrix of 16 rays per vertex; the truth is by brute force, twice 128 paths per element. 32 seeds of about
-    5500 elements.
+    A gathered matrix of 16 rays per vertex; the truth is by brute force, twice 128 paths per element. 32 seeds, with
+    about 4000 elements of each mesh for indirect light.
 
-    Result: total 4.9% (5.1% grey), terms 4.6% and 4.1%; estimates spread by 3%.
+    Result: total 4.9% (5.2% grey), terms 4.6% and 4.1%; the ground 4.0%, where 90% of each estimate would fail.
     """
     transport = rough(colour)
     truth = [rows_of(matrix) for matrix in converged(colour)]

@@ -213,6 +213,21 @@ def test_light_of_a_lamp_that_a_mirror_throws_on_a_wall(folder, artefact):
     assert distance < 0.03
 
 
+@pytest.mark.parametrize("lamp", [PLAIN, FAR], ids=["panel", "sun"])
+def test_what_rough_glass_focuses(folder, artefact, lamp):
+    """Rationale: rays that rough glass scatters meet area lamps, and points and suns are asked where it does.
+
+    Expected: the mean of `path` within four standard errors and 0.2%, and 3% beyond noise at single pixels.
+    Result: both 0.2% more, and 2.5% (sun). Without it, 4.0% less under the panel; 0.8% less and 4.0% under the sun.
+    """
+    ball = """<shape type="sphere"><bsdf type="roughdielectric"><float name="alpha" value="0.2"/></bsdf>
+        <point name="center" x="-0.4" y="-0.5" z="0.2"/><float name="radius" value="0.4"/></shape>"""
+    bias, error, distance = beside_path(load(folder, lamp + ball, 12), 12, artefact)
+    assert error < 0.002
+    assert abs(bias) < 4 * error + 0.002
+    assert distance < 0.03
+
+
 def test_a_screen_that_is_seen(folder, artefact):
     """Rationale: textured lamps shine as they look, in the picture and on the walls."""
     bias, error, distance = beside_path(load(folder, SCREEN), 4, artefact, 512)

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse, problem_at
+from conftest import BALL, GROUND, PALE, T, build, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.hidden_corners import hidden_corners
@@ -15,15 +15,12 @@ from mi_sparse_prt.solvers import form_factors
 from mi_sparse_prt.solvers.paths import PathSolver
 
 LIGHTING = prt.CubemapLighting(4)
-WHITE = diffuse(0.8, 0.8, 0.8)
-GROUND = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": WHITE}
 X = 0.07  # of the wall: between two rows of the ground's vertices
 WALL = {
     "type": "rectangle",
     "to_world": T().translate([X, 0.4, 0]).rotate([0, 1, 0], 90).scale([2, 0.5, 1]),
-    "bsdf": {"type": "twosided", "bsdf": WHITE},
+    "bsdf": {"type": "twosided", "bsdf": PALE},
 }
-BALL = {"type": "sphere", "center": [0.0, 0.4, 0.0], "radius": 0.4, "bsdf": WHITE}
 
 
 def on_ground(scene: prt.Scene) -> tuple[mi.UInt32, mi.SurfaceInteraction3f, list[mi.Float], np.ndarray]:
@@ -73,7 +70,7 @@ def test_nothing_is_hidden_where_nothing_passes_through():
     """
     Expected: none of a floating ball and the ground below it, nor of a cube's faces and edges.
     """
-    assert not hidden_corners(build(0.2, ground=GROUND, cube={"type": "cube", "bsdf": WHITE} | {
+    assert not hidden_corners(build(0.2, ground=GROUND, cube={"type": "cube", "bsdf": PALE} | {
         "to_world": T().translate([0, 0.5, 0]).scale(0.2)
     })).some  # fmt: skip
 
@@ -112,7 +109,7 @@ def test_no_light_leaks(name, direct, basis):
         at every vertex near it; paths, without noise there, find none at all (a ball's underside is lit from below
         beyond the ground's rim, so the ground is asked alone, near its middle).
     """
-    wall = {"type": "rectangle", "bsdf": WHITE, "to_world": T().translate([-1, 1, 0]).rotate([0, 1, 0], 90)}
+    wall = {"type": "rectangle", "bsdf": PALE, "to_world": T().translate([-1, 1, 0]).rotate([0, 1, 0], 90)}
     scene = build(0.1, ground=GROUND, **{name: wall if name == "wall" else BALL})
     transport = prt.precompute(scene, LIGHTING, Plan(direct, "gather"), basis, max_depth=3, progress=False)
     behind = LIGHTING.directions @ (np.array([1, 0, 0]) if name == "wall" else np.array([0, 1, 0])) < -0.3

@@ -17,6 +17,7 @@ from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.upsampled import Upsampled
+from mi_sparse_prt.precompute import GlossyOptions
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors, DirectionGrid
 from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.frames import frames, orthogonalise
@@ -493,11 +494,6 @@ SIGNATURES: list[tuple[Callable, dict[str, object]]] = [
             "terms": 4,
             "harmonics": None,
             "direct": "exact",
-            "max_depth": 5,
-            "rays": 64,
-            "tolerance": 0.06,
-            "seed": 0,
-            "progress": True,
         },
     ),
     (prt.render, {"scene": NONE, "transport": NONE, "environment": NONE}),
@@ -529,6 +525,14 @@ def test_all_that_precompute_was_given_since_is_by_keyword():
     parameters = list(inspect.signature(prt.precompute).parameters.values())
     assert all(parameter.kind is parameter.KEYWORD_ONLY for parameter in parameters[9:])
     assert {"terms", "harmonics"} <= {parameter.name for parameter in parameters[9:]}
+
+
+def test_what_precompute_glossy_hands_on():
+    """By keyword: its own parameters, and those of ``precompute``, which mean and default to the same."""
+    parameters = inspect.signature(prt.precompute_glossy).parameters
+    assert {"rays": 64, "tolerance": 0.06}.items() <= {k: p.default for k, p in parameters.items()}.items()
+    assert GlossyOptions.__annotations__.keys() == {"max_depth", "seed", "progress"}
+    assert GlossyOptions.__annotations__.keys() <= inspect.signature(prt.precompute).parameters.keys()
 
 
 def test_one_class_of_results():
