@@ -123,7 +123,7 @@ def test_a_picture_is_that_of_render(page, exported, artefact):
         ours = picture(
             page, "v.set({environment: arguments[0], degrees: arguments[1]})", [*LIGHTS].index(name), degrees
         )
-        theirs = prt.render(scene, transport, LIGHTS[name].rotated(degrees), 0, 256, progress=False)
+        theirs = prt.render(scene, transport, LIGHTS[name].rotated(degrees), 0, 64, progress=False)
         away = flip_map(np.clip(theirs, 0, 1), linear(ours)).mean()
         artefact(side_by_side(linear(ours), theirs), name)
         assert away < FLIP, f"{name}: {away:.4f}"
