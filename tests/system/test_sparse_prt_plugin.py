@@ -11,6 +11,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt import cache
 from mi_sparse_prt.scene.scene import Scene
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 SIZE = 32
 BALL = """
     <shape type="sphere" id="ball">

@@ -14,6 +14,7 @@ from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.solvers import form_factors
 from mi_sparse_prt.solvers.paths import PathSolver
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 LIGHTING = prt.CubemapLighting(4)
 WHITE = diffuse(0.8, 0.8, 0.8)
 GROUND = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": WHITE}
