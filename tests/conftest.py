@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 
 # ruff: noqa: E402
@@ -314,6 +315,23 @@ def assert_same(a: LightTransport, b: LightTransport) -> None:
     for name, array in ours.items():
         assert (array.dtype, array.shape) == (theirs[name].dtype, theirs[name].shape), name
         assert array.tobytes() == theirs[name].tobytes(), name
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files of systems and of units in turn, those with most tests first: the order of ``--no-loadscope-reorder``.
+
+    What takes long is begun early, and short files of units are left for the end, so that no worker waits for long.
+    Files that compile the same functions (of units beside each other: operators, matrices) do not begin together: both
+    workers would compile them, where the second one finds them in the cache a little later.
+    """
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    by_size = sorted(files, key=lambda path: (-len(files[path]), path))
+    units = [path for path in by_size if path.parent.name == "unit"]
+    systems = [path for path in by_size if path.parent.name != "unit"]
+    in_turn = [path for pair in zip_longest(systems, units) for path in pair if path is not None]
+    items[:] = [item for path in in_turn for item in files[path]]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.threads import run_in_parts
 
 Bits = NDArray[np.uint32]
 BITS = 32  # of a word
@@ -26,15 +27,18 @@ def above_horizon(normals: NDArray[np.float32], directions: NDArray[np.float32])
     padded = np.zeros((3, words * BITS), np.float32)  # a direction of zeros is above no horizon
     padded[:, : len(directions)] = np.asarray(directions).T
     bits = np.empty((len(normals), words), np.uint32)
-    _mark_above(np.ascontiguousarray(normals, np.float32), padded.reshape(3, words, BITS), bits)
+    normals = np.ascontiguousarray(normals, np.float32)
+    run_in_parts(_mark_above, len(bits), normals, padded.reshape(3, words, BITS), bits)
     return bits
 
 
-@numba.njit(parallel=True, cache=True)
-def _mark_above(normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits) -> None:
+@numba.njit(nogil=True, cache=True)
+def _mark_above(
+    first: int, last: int, normals: NDArray[np.float32], directions: NDArray[np.float32], bits: Bits
+) -> None:
     """Of directions (3, words, 32); without branches, so that a word takes a few vector instructions."""
     x, y, z = directions[0], directions[1], directions[2]
-    for i in numba.prange(len(normals)):
+    for i in range(first, last):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         for w in range(bits.shape[1]):
             word = np.uint32(0)
@@ -84,30 +88,34 @@ def bit_of(words: Bits, direction: int) -> np.uint32:
     return (words[direction // BITS] >> np.uint32(direction % BITS)) & np.uint32(1)
 
 
-@numba.njit(parallel=True, cache=True)
 def count_bits(bits: Bits) -> NDArray[np.int64]:
     """Number of set bits in each row, (n,)."""
     result = np.empty(len(bits), np.int64)
-    for i in numba.prange(len(bits)):
+    run_in_parts(_count, len(bits), bits, result)
+    return result
+
+
+@numba.njit(nogil=True, cache=True)
+def _count(first: int, last: int, bits: Bits, result: NDArray[np.int64]) -> None:
+    for i in range(first, last):
         total = np.uint32(0)
         for w in range(bits.shape[1]):
             total += count_ones(bits[i, w])  # type: ignore[call-arg]  # numba gives the context
         result[i] = total
-    return result
 
 
 def list_bits(bits: Bits) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """Row and direction of every set bit, row after row: two (m,) arrays."""
     starts = _starts(bits)
     rows, directions = np.empty(starts[-1], np.uint32), np.empty(starts[-1], np.uint32)
-    _fill(bits, starts, rows, directions)
+    run_in_parts(_fill, len(bits), bits, starts, rows, directions)
     return rows, directions
 
 
 def scatter_bits(mask: Bits, values: NDArray[np.bool_]) -> Bits:
     """The inverse of ``list_bits``: those bits of ``mask`` whose listed value is true, (n, words)."""
     result = np.empty_like(mask)
-    _scatter(mask, _starts(mask), values, result)
+    run_in_parts(_scatter, len(mask), mask, _starts(mask), values, result)
     return result
 
 
@@ -116,13 +124,19 @@ def _starts(bits: Bits) -> NDArray[np.int64]:
     return row_starts(count_bits(bits))
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _fill(
-    bits: Bits, starts: NDArray[np.int64], rows: NDArray[np.uint32], directions: NDArray[np.uint32]
+    first: int,
+    last: int,
+    bits: Bits,
+    starts: NDArray[np.int64],
+    rows: NDArray[np.uint32],
+    directions: NDArray[np.uint32],
 ) -> None:
-    for i in numba.prange(len(bits)):
+    for i in range(first, last):
         at = starts[i]
-        rows[at : starts[i + 1]] = i
+        for k in range(at, starts[i + 1]):  # not a slice, which compiles for seconds
+            rows[k] = i
         for w in range(bits.shape[1]):
             left = bits[i, w]
             while left:
@@ -131,9 +145,16 @@ def _fill(
                 left &= left - np.uint32(1)
 
 
-@numba.njit(parallel=True, cache=True)
-def _scatter(mask: Bits, starts: NDArray[np.int64], values: NDArray[np.bool_], result: Bits) -> None:
-    for i in numba.prange(len(mask)):
+@numba.njit(nogil=True, cache=True)
+def _scatter(
+    first: int,
+    last: int,
+    mask: Bits,
+    starts: NDArray[np.int64],
+    values: NDArray[np.bool_],
+    result: Bits,
+) -> None:
+    for i in range(first, last):
         at = starts[i]
         for w in range(mask.shape[1]):
             left, word = mask[i, w], np.uint32(0)
@@ -164,20 +185,24 @@ def overwrite_bits(
     (n,) int64
         How many bits of each row were otherwise before.
     """
-    return _overwrite(bits, known, rows, mask, _starts(mask), values)
+    changed = np.zeros(len(rows), np.int64)
+    run_in_parts(_overwrite, len(rows), bits, known, rows, mask, _starts(mask), values, changed)
+    return changed
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _overwrite(
+    first: int,
+    last: int,
     bits: Bits,
     known: Bits,
     rows: NDArray[np.int64],
     mask: Bits,
     starts: NDArray[np.int64],
     values: NDArray[np.bool_],
-) -> NDArray[np.int64]:
-    changed = np.zeros(len(rows), np.int64)
-    for i in numba.prange(len(rows)):
+    changed: NDArray[np.int64],
+) -> None:
+    for i in range(first, last):
         at, row = starts[i], rows[i]
         for w in range(mask.shape[1]):
             left, word = mask[i, w], np.uint32(0)
@@ -191,4 +216,3 @@ def _overwrite(
             changed[i] += count_ones(before ^ word)  # type: ignore[call-arg]
             bits[row, w] ^= before ^ word
             known[row, w] |= mask[i, w]
-    return changed

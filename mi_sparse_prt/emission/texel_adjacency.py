@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bit_of, pack
 from mi_sparse_prt.core.read_only import read_only
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cube_faces import cube_points, face_places, texels_beside
 
 # steps (columns, rows) across the sides of a texel, and across the corner between each side and the next one
@@ -112,7 +113,8 @@ class TexelSides:
         result = np.zeros((len(seen), -(-len(self.paths) // BITS)), np.uint32)
         first, second = self.tables.first[self._outer], self.tables.second[self._outer]
         seen, known = read_only(seen), read_only(known)
-        _mark_differing(seen, known, self._right, self._below, self._resolution, first, second, result)
+        sides = self._right, self._below, self._resolution, first, second
+        run_in_parts(_mark_differing, len(seen), seen, known, *sides, result)
         return result
 
 
@@ -151,8 +153,10 @@ def _quadrants(beside: Ints, across: Ints, ways: Ints) -> Ints:
     return np.stack(corners, axis=1).astype(np.int32)  # [texel, corner, pair]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _mark_differing(
+    start: int,
+    end: int,
     seen: Bits,
     known: Bits,
     right: Bits,
@@ -168,7 +172,7 @@ def _mark_differing(
     of the others.
     """
     words = seen.shape[1]
-    for i in numba.prange(len(seen)):
+    for i in range(start, end):
         for w in range(words):
             both = known[i, w] & right[w] & _word_ahead(known[i], w, 1)
             result[i, w] = both & (seen[i, w] ^ _word_ahead(seen[i], w, 1))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bit_of, bits_at
 from mi_sparse_prt.core.ragged import select_rows
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 from mi_sparse_prt.operators.visibility import SeenTexels, check_bits
@@ -105,7 +106,9 @@ class FractionalVisibility(Operator):
     def elements(self, ids: Ids, texels: Ids) -> Floats:
         weighted = *_means(self.lighting.resolution), self._weights()
         asked = np.asarray(ids, np.int64), np.asarray(texels, np.int64)
-        return _single(self.seen, self.normals, *weighted, *asked)[:, None]
+        result = np.empty(len(ids), np.float32)
+        run_in_parts(_single, len(result), self.seen, self.normals, *weighted, *asked, result)
+        return result[:, None]
 
     def check(self) -> None:
         check_bits(self.bits, self.normals, self.lighting)
@@ -229,8 +232,10 @@ def _expand(
                 result[i, c] = share * _mean_cosine(cosine, falloffs[c]) * weights[c]
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _single(
+    first: int,
+    last: int,
     seen_texels: SeenTexels,
     normals: Floats,
     directions: Floats,
@@ -238,11 +243,11 @@ def _single(
     weights: Floats,
     ids: NDArray[np.int64],
     asked: NDArray[np.int64],
-) -> Floats:
+    result: Floats,
+) -> None:
     """Elements of vertices ``ids`` and texels ``asked``."""
     bits, starts, texels, shares = seen_texels
-    result = np.empty(len(ids), np.float32)
-    for m in numba.prange(len(ids)):
+    for m in range(first, last):
         i, j = ids[m], asked[m]
         cosine = np.float32(0)
         for d in range(3):
@@ -254,4 +259,3 @@ def _single(
         else:
             share = np.float32(bit_of(bits[i], j))
         result[m] = share * _mean_cosine(cosine, falloffs[j]) * weights[j]
-    return result

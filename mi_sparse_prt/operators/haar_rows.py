@@ -14,6 +14,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.ragged import select_rows
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.haar import haar, inverse_haar
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
@@ -101,8 +102,11 @@ class HaarRows(Operator):
 
     def _products(self, vectors: Floats) -> Floats:
         """(n_v, channels, k) with transformed vectors (1 or channels, n_directions, k)."""
-        multiply = _times_three if vectors.shape[2] == 3 else _times
-        return multiply(self.starts, self.places, self.values.view(np.uint16), self.scales, vectors)
+        (n, channels), k = self.scales.shape, vectors.shape[2]
+        result = np.zeros((n, channels, k), np.float32)
+        lists = self.starts, self.places, self.values.view(np.uint16), self.scales
+        run_in_parts(_times_three if k == 3 else _times, n, *lists, vectors, result)
+        return result
 
     def _scale(self) -> Floats:
         return np.sqrt(self.lighting.solid_angles, dtype=np.float32)
@@ -115,22 +119,24 @@ def half_float(half: int) -> np.float32:
     return bits.view(np.float32) * np.float32(2.0**112)
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _times_three(
+    first: int,
+    last: int,
     starts: NDArray[np.int64],
     places: NDArray[np.unsignedinteger],
     halves: NDArray[np.uint16],
     scales: Floats,
     vectors: Floats,
-) -> Floats:
+    result: Floats,
+) -> None:
     """``_times`` with three vectors: the sums stay in registers. Slices keep checks of signs out of the loop."""
-    n, channels = scales.shape
-    result = np.empty((n, channels, 3), np.float32)
-    for i in numba.prange(n):
+    channels = scales.shape[1]
+    for i in range(first, last):
         for c in range(channels):
             light = vectors[c % len(vectors)]
-            first, last = starts[i * channels + c], starts[i * channels + c + 1]
-            own_places, own_halves = places[first:last], halves[first:last]
+            start, end = starts[i * channels + c], starts[i * channels + c + 1]
+            own_places, own_halves = places[start:end], halves[start:end]
             red, green, blue = np.float32(0), np.float32(0), np.float32(0)
             for e in range(len(own_places)):
                 value, j = half_float(own_halves[e]), own_places[e]
@@ -139,28 +145,27 @@ def _times_three(
                 blue += value * light[j, 2]
             scale = scales[i, c]
             result[i, c, 0], result[i, c, 1], result[i, c, 2] = red * scale, green * scale, blue * scale
-    return result
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
+@numba.njit(nogil=True, fastmath=True, cache=True)
 def _times(
+    first: int,
+    last: int,
     starts: NDArray[np.int64],
     places: NDArray[np.unsignedinteger],
     halves: NDArray[np.uint16],
     scales: Floats,
     vectors: Floats,
-) -> Floats:
+    result: Floats,
+) -> None:
     """Products (n, channels, k) of lists with vectors (1 or channels, m, k), the same for all channels or one each."""
-    n, channels = scales.shape
-    k = vectors.shape[2]
-    result = np.zeros((n, channels, k), np.float32)
-    for i in numba.prange(n):
+    channels, k = scales.shape[1], vectors.shape[2]
+    for i in range(first, last):
         for c in range(channels):
             light, sums = vectors[c % len(vectors)], result[i, c]
-            first, last = starts[i * channels + c], starts[i * channels + c + 1]
-            own_places, own_halves = places[first:last], halves[first:last]
+            start, end = starts[i * channels + c], starts[i * channels + c + 1]
+            own_places, own_halves = places[start:end], halves[start:end]
             for e in range(len(own_places)):
                 value, j = half_float(own_halves[e]) * scales[i, c], own_places[e]
                 for q in range(k):
                     sums[q] += value * light[j, q]
-    return result

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, unpack
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator, multiply_converted
 
@@ -46,7 +47,8 @@ class MeanCosine(Operator):
 
     def dense_columns(self, texels: Ids, out: Floats) -> Floats:
         power = self.lighting.solid_angles[texels] / np.float32(np.pi)
-        _convert(self.fixed, np.asarray(texels, np.int64), power / np.float32(FIXED_POINT), out)
+        units = power / np.float32(FIXED_POINT)
+        run_in_parts(_convert, len(out), self.fixed, np.asarray(texels, np.int64), units, out)
         return out
 
     def elements(self, ids: Ids, texels: Ids) -> Floats:
@@ -68,9 +70,11 @@ class MeanCosine(Operator):
         return self.lighting.solid_angles / np.float32(np.pi * FIXED_POINT)
 
 
-@numba.njit(parallel=True, cache=True)
-def _convert(fixed: NDArray[np.uint16], texels: NDArray[np.int64], units: Floats, result: Floats) -> None:
+@numba.njit(nogil=True, cache=True)
+def _convert(
+    first: int, last: int, fixed: NDArray[np.uint16], texels: NDArray[np.int64], units: Floats, result: Floats
+) -> None:
     """Elements (n, m): multiples of the units (m,)."""
-    for i in numba.prange(len(fixed)):
+    for i in range(first, last):
         for j in range(len(texels)):
             result[i, j] = np.float32(fixed[i, texels[j]]) * units[j]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, bits_at
 from mi_sparse_prt.core.read_only import read_only
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
@@ -59,7 +60,10 @@ class Visibility(Operator):
         return self.bits
 
     def rows(self, ids: Ids) -> Floats:
-        return _expanded_rows(self.bits, self.normals, np.asarray(ids, np.int64), self._weighted)[..., None]
+        ids, weighted = np.asarray(ids, np.int64), self._weighted
+        result = np.zeros((len(ids), weighted.shape[1]), np.float32)
+        run_in_parts(_expand_rows, len(ids), self.bits, self.normals, ids, weighted, result)
+        return result[..., None]
 
     def columns(self, ids: Ids) -> Floats:
         return self.dense_columns(ids, np.empty((len(self.bits), len(ids)), np.float32))[..., None]
@@ -83,7 +87,9 @@ class Visibility(Operator):
         power = np.zeros((3, n_padded), dtype=np.float32)
         directions[:, : len(lighting)] = self.lighting.directions.T
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
-        return _relight_bits(self.bits, self.normals, directions, power)
+        radiance = np.zeros((len(self.bits), 3), np.float32)
+        run_in_parts(_relight_bits, len(radiance), self.bits, self.normals, directions, power, radiance)
+        return radiance
 
     def masked(self, points: NDArray[np.int64], open: Bits) -> Visibility:
         bits = self.bits.copy()
@@ -94,9 +100,10 @@ class Visibility(Operator):
         texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
         power = self._weights()[texels]
         weighted = np.moveaxis(self.lighting.directions[texels], 2, 1) * power[:, None]  # [word, xyz, bit]
-        return _combine(
-            self.bits, self.normals, np.asarray(words, np.int64), np.ascontiguousarray(weighted), signs
-        )
+        arrays = np.asarray(words, np.int64), np.ascontiguousarray(weighted), signs
+        result = np.zeros((len(self.bits), signs.shape[1]), np.float32)
+        run_in_parts(_combine, len(result), self.bits, self.normals, *arrays, result)
+        return result
 
     def check(self) -> None:
         check_bits(self.bits, self.normals, self.lighting)
@@ -117,13 +124,18 @@ def check_bits(bits: Bits, normals: Floats, lighting: CubemapLighting) -> None:
         raise ValueError(f"visibility {bits.shape} and normals {normals.shape} do not fit together")
 
 
-@numba.njit(parallel=True, cache=True)
-def _expanded_rows(
-    bits: NDArray[np.uint32], normals: Floats, ids: NDArray[np.int64], weighted: Floats
-) -> Floats:
+@numba.njit(nogil=True, cache=True)
+def _expand_rows(
+    first: int,
+    last: int,
+    bits: NDArray[np.uint32],
+    normals: Floats,
+    ids: NDArray[np.int64],
+    weighted: Floats,
+    result: Floats,
+) -> None:
     """Elements (n, m) of rows ``ids``; weighted (3, m) are directions times power."""
-    result = np.zeros((len(ids), weighted.shape[1]), np.float32)
-    for i in numba.prange(len(ids)):
+    for i in range(first, last):
         nx, ny, nz = normals[ids[i], 0], normals[ids[i], 1], normals[ids[i], 2]
         for word in range(bits.shape[1]):
             mask = bits[ids[i], word]
@@ -133,14 +145,20 @@ def _expanded_rows(
                 cosine = nx * weighted[0, j] + ny * weighted[1, j] + nz * weighted[2, j]
                 seen = np.float32((mask >> np.uint32(j % 32)) & np.uint32(1))
                 result[i, j] = max(cosine, np.float32(0)) * seen
-    return result
 
 
-@numba.njit(parallel=True, fastmath=True, cache=True)
-def _relight_bits(bits: NDArray[np.uint32], normals: Floats, directions: Floats, power: Floats) -> Floats:
+@numba.njit(nogil=True, fastmath=True, cache=True)
+def _relight_bits(
+    first: int,
+    last: int,
+    bits: NDArray[np.uint32],
+    normals: Floats,
+    directions: Floats,
+    power: Floats,
+    radiance: Floats,
+) -> None:
     """Sum of power[:, j] * max(0, n_i . w_j) over the set bits j of row i; the inner loop is one word of bits."""
-    radiance = np.zeros((bits.shape[0], 3), dtype=np.float32)
-    for i in numba.prange(bits.shape[0]):
+    for i in range(first, last):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         red, green, blue = np.float32(0), np.float32(0), np.float32(0)
         for word in range(bits.shape[1]):
@@ -155,7 +173,6 @@ def _relight_bits(bits: NDArray[np.uint32], normals: Floats, directions: Floats,
                 green += seen * power[1, j]
                 blue += seen * power[2, j]
         radiance[i, 0], radiance[i, 1], radiance[i, 2] = red, green, blue
-    return radiance
 
 
 @numba.njit(parallel=True, cache=True)
@@ -176,13 +193,19 @@ def _expand_columns(
             result[i, j] = max(light, np.float32(0)) * np.float32(seen)
 
 
-@numba.njit(parallel=True, fastmath={"contract"}, cache=True)
+@numba.njit(nogil=True, fastmath={"contract"}, cache=True)
 def _combine(
-    bits: NDArray[np.uint32], normals: Floats, words: NDArray[np.int64], weighted: Floats, signs: Floats
-) -> Floats:
+    first: int,
+    last: int,
+    bits: NDArray[np.uint32],
+    normals: Floats,
+    words: NDArray[np.int64],
+    weighted: Floats,
+    signs: Floats,
+    result: Floats,
+) -> None:
     """Sums (n, k) over words of the elements at their bits, with signs (words, k); weighted (words, 3, k)."""
-    result = np.zeros((len(bits), signs.shape[1]), np.float32)
-    for i in numba.prange(len(bits)):
+    for i in range(first, last):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         for g in range(len(words)):
             mask = bits[i, words[g]]
@@ -192,4 +215,3 @@ def _combine(
                 light = nx * weighted[g, 0, k] + ny * weighted[g, 1, k] + nz * weighted[g, 2, k]
                 seen = signs[g, k] * np.float32((mask >> np.uint32(k)) & np.uint32(1))
                 result[i, k] += max(light, np.float32(0)) * seen
-    return result

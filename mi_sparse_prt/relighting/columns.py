@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.compression.haar_truncation import haar_lists
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.operators.haar_rows import HaarRows, half_float
 from mi_sparse_prt.operators.operator import Operator
@@ -52,7 +53,9 @@ class WaveletColumns:
 
     def norms(self) -> Floats:
         """(m,) norms of the columns over all rows and channels."""
-        return _norms(self.starts, self.places, self.values.view(np.uint16), self.scales)
+        norms, halves = np.empty(self.starts.shape[1] - 1, np.float32), self.values.view(np.uint16)
+        run_in_parts(_norms, len(norms), self.starts, self.places, halves, self.scales, norms)
+        return norms
 
 
 def wavelet_columns(
@@ -97,11 +100,18 @@ def _transposed(block: HaarRows, m: int) -> tuple[Ints, NDArray[np.uint16], NDAr
     return starts, lists[order], block.values[order]
 
 
-@numba.njit(parallel=True, cache=True)
-def _norms(starts: Ints, places: NDArray[np.uint16], halves: NDArray[np.uint16], scales: Floats) -> Floats:
-    blocks, m, channels = len(starts), starts.shape[1] - 1, scales.shape[1]
-    norms = np.zeros(m, np.float32)
-    for j in numba.prange(m):
+@numba.njit(nogil=True, cache=True)
+def _norms(
+    first: int,
+    last: int,
+    starts: Ints,
+    places: NDArray[np.uint16],
+    halves: NDArray[np.uint16],
+    scales: Floats,
+    norms: Floats,
+) -> None:
+    blocks, channels = len(starts), scales.shape[1]
+    for j in range(first, last):
         total = 0.0
         for block in range(blocks):
             first = block * BLOCK
@@ -109,7 +119,6 @@ def _norms(starts: Ints, places: NDArray[np.uint16], halves: NDArray[np.uint16],
                 row, channel = divmod(int(places[e]), channels)
                 total += (half_float(halves[e]) * scales[first + row, channel]) ** 2
         norms[j] = np.sqrt(total)
-    return norms
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

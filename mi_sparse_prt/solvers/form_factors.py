@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.core.sobol import sobol_points
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
@@ -300,37 +301,38 @@ def _interleaved(x: NDArray[np.uint32], y: NDArray[np.uint32]) -> NDArray[np.uin
     return result
 
 
-@numba.njit(parallel=True, cache=True)
-def _sorted(hits: NDArray[np.int32]) -> NDArray[np.int64]:
+@numba.njit(nogil=True, cache=True)
+def _sort(first: int, last: int, hits: NDArray[np.int32], counts: NDArray[np.int64]) -> None:
     """Sort each row in place; how many different vertices it has."""
-    counts = np.empty(len(hits), np.int64)
-    for i in numba.prange(len(hits)):
+    for i in range(first, last):
         row = hits[i]
         row.sort()
         count = 0
         for k in range(len(row)):
             count += row[k] < NOTHING and (k == 0 or row[k] != row[k - 1])
         counts[i] = count
-    return counts
 
 
 def _merged(hits: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
     """Entries of each row (n,), their columns, in order, and how many rays they got, (m,) each."""
-    counts = _sorted(hits)
+    counts = np.empty(len(hits), np.int64)
+    run_in_parts(_sort, len(hits), hits, counts)
     columns = np.empty(counts.sum(), np.int32)
     values = np.empty(len(columns), np.float32)
-    _fill(hits, np.cumsum(counts) - counts, columns, values)
+    run_in_parts(_fill, len(hits), hits, np.cumsum(counts) - counts, columns, values)
     return counts, columns, values
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _fill(
+    first: int,
+    last: int,
     hits: NDArray[np.int32],
     starts: NDArray[np.int64],
     columns: NDArray[np.int32],
     values: NDArray[np.float32],
 ) -> None:
-    for i in numba.prange(len(hits)):
+    for i in range(first, last):
         at = starts[i] - 1
         for k in range(hits.shape[1]):
             vertex = hits[i, k]

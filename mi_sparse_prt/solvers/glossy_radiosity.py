@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.metrics import relative_noise
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.by_depth import ByDepth
@@ -239,12 +240,15 @@ def gather_matrix(
     into = row_starts(np.where(glossy, rays.counts, 0))
     where = rays.points, first, into, shiny
     found = rays.into, np.ascontiguousarray(rays.out[:, own]), np.float32(1 / rays.per_vertex)
-    _fill(where, rays.seen, (number, node, len(nodes)), found, starts, columns, values)
+    numbers = number, node, len(nodes)
+    run_in_parts(_fill, len(rays.points), where, rays.seen, numbers, found, starts, columns, values)
     return scipy.sparse.csr_array((values, columns, starts), shape=(rows, direct.shape[0]))
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _fill(
+    first: int,
+    last: int,
     where: tuple[NDArray[np.int64], ...],
     seen: NDArray[np.int32],
     numbers: tuple[NDArray[np.int64], NDArray[np.int64], int],
@@ -254,18 +258,18 @@ def _fill(
     values: Floats,
 ) -> None:
     """Rows of each point: unit-albedo light, then its terms; entries of a ray likewise."""
-    (points, first, first_into, first_out), (number, node, nodes) = where, numbers
+    (points, rays, first_into, first_out), (number, node, nodes) = where, numbers
     into, out, share = found
     n, terms = len(number), out.shape[1]
-    for i in numba.prange(len(points)):
+    for i in range(first, last):
         own = number[points[i]]
         for row in range(1 + terms if own >= 0 else 1):
             if row == 0 and node[points[i]] < 0:
                 continue
             at = starts[node[points[i]]] if row == 0 else starts[nodes + own * terms + row - 1]
             shiny = first_out[i]
-            for ray in range(first[i], first[i + 1]):
-                weight = share if row == 0 else share * into[first_into[i] + ray - first[i], row - 1]
+            for ray in range(rays[i], rays[i + 1]):
+                weight = share if row == 0 else share * into[first_into[i] + ray - rays[i], row - 1]
                 columns[at], values[at] = seen[ray], weight
                 at += 1
                 other = number[seen[ray]]

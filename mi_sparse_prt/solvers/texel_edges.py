@@ -126,7 +126,7 @@ def _cut_texels(
         np.uint16, np.min_scalar_type(m - 1)
     )  # 16 bits at least: one compiled kernel for most
     texels, shares = np.empty(starts[-1], kind), np.empty(starts[-1], np.uint8)
-    _unpack(entries, room, starts, texels, shares)
+    run_in_parts(_unpack, len(number), entries, room, starts, texels, shares)
     return seen, number, texels, shares
 
 
@@ -189,15 +189,17 @@ def _listed(texel: int, share: float, bit: np.uint32, entries: NDArray[np.uint32
     return at + 1
 
 
-@numba.njit(parallel=True, cache=True)
+@numba.njit(nogil=True, cache=True)
 def _unpack(
+    first: int,
+    last: int,
     entries: NDArray[np.uint32],
     room: NDArray[np.int64],
     starts: NDArray[np.int64],
     texels: NDArray[np.unsignedinteger],
     shares: NDArray[np.uint8],
 ) -> None:
-    for i in numba.prange(len(starts) - 1):
+    for i in range(first, last):
         for e in range(starts[i + 1] - starts[i]):
             entry = entries[room[i] + e]
             texels[starts[i] + e] = entry >> np.uint32(8)

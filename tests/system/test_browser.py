@@ -138,7 +138,7 @@ def test_a_picture_is_that_of_render(page, exported, artefact):
             page, "v.set({environment: arguments[0], ...arguments[1]})", [*LIGHTS].index(name), how
         )
         light = LIGHTS[name].rotated(turn_matrix(**how))
-        theirs = prt.render(scene, transport, light, 0, 256, progress=False)
+        theirs = prt.render(scene, transport, light, 0, 64, progress=False)
         away = flip_map(np.clip(theirs, 0, 1), linear(ours)).mean()
         artefact(side_by_side(linear(ours), theirs), f"turn {number}")
         assert away < FLIP, f"{name} {how}: {away:.4f}"

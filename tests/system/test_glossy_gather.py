@@ -20,7 +20,7 @@ from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.transport import LightTransport
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not diffuse")
+pytestmark = [pytest.mark.filterwarnings("ignore:.*is not diffuse"), pytest.mark.usefixtures("no_held_out")]
 
 LIGHTING = prt.CubemapLighting(8)
 TERMS, RAYS, TOLERANCE = 3, 1024, 0.01

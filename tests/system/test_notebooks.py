@@ -81,7 +81,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
 }
 
-# What conftest.py does, for the process of a notebook: errors and BRDF factors of less effort than users have
+# What conftest.py does, for the process of a notebook: errors and BRDF factors of less effort than users have; and
+# plans whose costs are measured at fewer vertices, and coarser figures
 LESS_EFFORT = """
 import importlib
 from functools import partial
@@ -95,6 +96,9 @@ pipeline.held_out_error = partial(held_out_error, effort=Effort(spp=64, specular
 factor_cache.FactorOptions = partial(factor_cache.FactorOptions, grid=DirectionGrid(32, 64), pairs=1 << 15)
 harmonics = importlib.import_module("mi_sparse_prt.reflection.brdf_factors.harmonics")
 harmonics.DirectionGrid = partial(DirectionGrid, 32, 64)
+pilot = importlib.import_module("mi_sparse_prt.planner.pilot")
+pilot.VERTICES, pilot.TEXELS = 32, 4
+importlib.import_module("matplotlib").rcParams["figure.dpi"] = 50
 """
 
 

@@ -13,6 +13,7 @@ from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 LIGHTING = prt.CubemapLighting(8)
 EDGE = 0.5
 QUARTER = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # x -> -z, about up

@@ -15,6 +15,7 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.walls import Walls
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 LIGHTING = prt.CubemapLighting(8)
 WIDTH, HEIGHT, THICK = 0.05, 0.3, 0.005  # of a closed corridor on the floor; halves, but for the height
 LENGTH, CLOSET = 0.5, 0.05

@@ -14,6 +14,7 @@ from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.solvers import form_factors
 from mi_sparse_prt.solvers.paths import PathSolver
 
+pytestmark = pytest.mark.usefixtures("no_held_out")
 LIGHTING = prt.CubemapLighting(4)
 X = 0.07  # of the wall: between two rows of the ground's vertices
 WALL = {

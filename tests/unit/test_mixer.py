@@ -59,8 +59,8 @@ def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
 
     Rationale: all light is linear in what emitters send out, and no cluster has lights of two of them.
     Expected: of 8 seeds, means of the picture's colours agree within 3 standard errors; pictures differ (RMS) by less
-    than 1.5%, and with all columns by less than 0.5%, as particles and points on the lamp are others; the lamp's face
-    is as bright.
+    than 1.5%, and with all columns (of three) by less than 0.5%, as particles and points on the lamp are others; the
+    lamp's face is as bright.
     """
     weights = {"lamp": (0.2, 0.5, 1.5), "point": 4.0}
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": [6 * 0.2, 5 * 0.5, 4 * 1.5]}}
@@ -74,12 +74,13 @@ def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
     for seed in range(8):
         mixed.append(prt.render_many_lights(before, groups=True, seed=seed, **asked).mixed(weights))
         changed.append(prt.render_many_lights(after, seed=seed, **asked).image)
-        exact.append(
-            [
-                prt.render_many_lights(before, groups=True, seed=seed, **every).mixed(weights),
-                prt.render_many_lights(after, seed=seed, **every).image,
-            ]
-        )
+        if seed < 3:  # with all columns there is next to no spread
+            exact.append(
+                [
+                    prt.render_many_lights(before, groups=True, seed=seed, **every).mixed(weights),
+                    prt.render_many_lights(after, seed=seed, **every).image,
+                ]
+            )
     difference = np.array(mixed) - changed  # [seed, y, x, rgb]
     apart = relative_l2(np.array(mixed), np.array(changed))
     lights = relative_l2(*np.array(exact).swapaxes(0, 1))
