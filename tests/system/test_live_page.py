@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse, still_life
+from conftest import T, build, diffuse, still_life, without_held_out
 from pages_in_browser import DROP, MARKS, SIZE, UNTIL, browser, linear, open_page, picture, sky, webdriver
 from scipy.ndimage import binary_dilation
 
@@ -60,11 +60,13 @@ def scene():
 @pytest.fixture(scope="module")
 def transports(scene):
     options = {"method": "gather", "max_depth": 3, "progress": False}
-    return {
-        "glossy": prt.precompute(scene, LIGHTING, terms=6, **options),
-        "lamps": prt.precompute(scene, prt.SceneEmitters(scene), max_depth=3, progress=False),
-        "clusters": prt.compress(prt.precompute(scene, LIGHTING, terms=0, **options), progress=False),
-    }
+    with without_held_out():
+        found = {
+            "glossy": prt.precompute(scene, LIGHTING, terms=6, **options),
+            "lamps": prt.precompute(scene, prt.SceneEmitters(scene), max_depth=3, progress=False),
+        }
+    clusters = prt.compress(prt.precompute(scene, LIGHTING, terms=0, **options), progress=False)
+    return found | {"clusters": clusters}
 
 
 @pytest.fixture(scope="module")
