@@ -177,37 +177,31 @@ class Elements:
                 self._check_sum(values, np.unique(ids))
                 yield values
 
-    def sum_pairs(
-        self, ids: Ids, weights: Floats, done: Done = lambda _: None
-    ) -> tuple[Floats, NDArray[np.float64]]:
-        """Sums of the means of pairs of columns (m, 3), and how far apart those of each pair are.
+    def squared_differences(self, ids: Ids, weights: Floats, rows: Ids) -> NDArray[np.float64]:
+        """How far apart pairs of columns are: squares (k,) of differences, of the means of some pixels, all channels.
 
         Parameters
         ----------
         ids : (sets, 2 k) integers
             Both columns of a pair follow each other.
         weights : (sets, 2 k, 3) float32
-        done : callable
-
-        Returns
-        -------
-        sums : (m, 3) float32
-        squares : (k,) float64
-            Of the differences, as the means of pixels have them, over pixels and channels.
+        rows : (r,) integers
+            All of each of these pixels, ascending.
         """
-        m, pairs = len(self.samples), np.shape(ids)[-1] // 2
-        chosen, total = self._chosen(ids, weights), dr.zeros(mi.Color3f, m)
-        squares = np.zeros(pairs)
-        for a in range(0, pairs, step := max(1, LANES // m)):
-            count = min(step, pairs - a)
-            total, apart = self._paired(total, chosen, a, count)
-            difference = apart.numpy().reshape(3, count, m)
+        sets, total = ids.shape
+        own = self.samples.ids[rows] % sets
+        order = np.argsort(own, kind="stable")
+        chosen = _on_device(ids, weights, rows[order], own[order] * total)
+        place, squares = mi.UInt32(order.astype(np.uint32)), np.zeros(total // 2)
+        dr.eval(place)
+        for a in range(0, len(squares), step := max(1, LANES // len(rows))):
+            count = min(step, len(squares) - a)
+            found = self._differences(chosen, place, a, count).numpy().reshape(3, count, len(rows))
             for k in range(count):
-                means = self.samples.pixel_means(difference[:, k])
+                means = self.samples.pixel_means(found[:, k], np.asarray(rows, np.int64))
                 squares[a + k] = np.square(means, dtype=np.float64).sum()
-            done(2 * count)
-        self.evaluated += 2 * m * pairs
-        return self._by_sample(total, chosen, np.unique(ids)), squares
+        self.evaluated += len(rows) * total
+        return squares
 
     def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
         """All columns at some rows, projected as soon as they are known ([HPB07] 4).
@@ -327,23 +321,19 @@ class Elements:
         return found
 
     @dr.syntax
-    def _paired(
-        self, total: mi.Color3f, chosen: _Chosen, first: int, count: int
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Means of pairs of columns added up, and their differences (count * m)."""
-        m = len(self.samples)
+    def _differences(self, chosen: _Chosen, place: mi.UInt32, first: int, count: int) -> mi.Color3f:
+        """Of pairs of columns, each pair's after those of the one before (count * rows), rows at their places."""
         at, start = self.samples.receivers(chosen.samples), chosen.starts + dr.opaque(mi.UInt32, 2 * first)
-        total, apart, rows = mi.Color3f(total), dr.zeros(mi.Color3f, m * count), dr.opaque(mi.UInt32, m)
+        apart, rows = dr.zeros(mi.Color3f, dr.width(place) * count), dr.opaque(mi.UInt32, dr.width(place))
         k, last, before = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 2 * count), mi.Color3f(0)
         while k < last:
             light = self.lights.arrays.take(dr.gather(mi.UInt32, chosen.columns, start + k))
             value = dr.gather(mi.Color3f, chosen.weights, start + k) * self.element(at, light, mi.Mask(True))
-            total += 0.5 * value
-            dr.scatter(apart, before - value, (k >> 1) * rows + chosen.samples, (k & 1) == 1)
+            dr.scatter(apart, before - value, (k >> 1) * rows + place, (k & 1) == 1)
             before = mi.Color3f(value)
             k += 1
-        dr.eval(total, apart)
-        return total, apart
+        dr.eval(apart)
+        return apart
 
     @dr.syntax
     def _norms(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +13,9 @@ from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedCol
 from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_costs, with_lengths
 
 DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
-SECOND = 0.1  # of the clusters have a second representative, which tells the error
+SECOND = 0.5  # of the clusters have second representatives, which tell the error,
+PIXELS = 1 / 32  # at so many of the pixels: clusters differ more from each other than pixels do
+FEWEST_PIXELS = 1024
 
 Ids = NDArray[np.int64]
 Doubles = NDArray[np.float64]
@@ -173,10 +176,7 @@ def _drawn(weights: Doubles, members: Ids, u: Doubles) -> tuple[Ids, Doubles]:
 def sum_with_error(
     elements: Elements, partition: Partition, sets: int, rng: np.random.Generator, done: Done = lambda _: None
 ) -> Estimate:
-    """The sum of all columns by representatives of each cluster, second ones of some, which tell the expected error.
-
-    For independent X and X' alike, E|X - E X|^2 = E|X - X'|^2 / 2 ([HPB07] Appendix A): here of whole columns, as the
-    image shows them. Those clusters are drawn by cost and by energy, and count by the mean of their two.
+    """The sum of all columns by representatives of each cluster, and the expected error.
 
     Parameters
     ----------
@@ -189,16 +189,32 @@ def sum_with_error(
         Is told how many columns more are done.
     """
     first, second = (draw_representatives(partition, sets, rng) for _ in range(2))
+    values = elements.sum_columns(first.ids, first.weights, done)
+    return Estimate(values, _squared_error(elements, partition, first, second, rng))
+
+
+def _squared_error(
+    elements: Elements,
+    partition: Partition,
+    first: Representatives,
+    second: Representatives,
+    rng: np.random.Generator,
+) -> float:
+    """Expected, by second representatives of some clusters at some pixels; NaN where none has any.
+
+    For independent X and X' alike, E|X - E X|^2 = E|X - X'|^2 / 2 ([HPB07] Appendix A): here of whole columns, as the
+    image shows them. Clusters are drawn by cost and by energy, and count by the inverse of their chance.
+    """
     chance = _chances(partition)
     twice = np.flatnonzero(_systematic(chance, rng))
-    once = np.setdiff1d(np.arange(len(chance)), twice)
-    values = elements.sum_columns(first.ids[:, once], first.weights[:, once], done)
-    ids = np.stack([first.ids[:, twice], second.ids[:, twice]], axis=2).reshape(sets, -1)
-    weights = np.stack([first.weights[:, twice], second.weights[:, twice]], axis=2).reshape(sets, -1, 3)
-    means, squares = elements.sum_pairs(ids, weights, done)
-    squared = float((squares / 2 * (1 / chance[twice] - 1 / 2)).sum())
-    values += means
-    return Estimate(values, squared if len(twice) else (0.0 if not chance.any() else float("nan")))
+    if not len(twice):
+        return float("nan") if chance.any() else 0.0
+    count = max(round(PIXELS * math.prod(elements.samples.shape)), FEWEST_PIXELS)
+    rows, pixels = elements.samples.rows_of_pixels(count, rng)
+    ids = np.stack([first.ids[:, twice], second.ids[:, twice]], axis=2).reshape(len(first.ids), -1)
+    weights = np.stack([first.weights[:, twice], second.weights[:, twice]], axis=2).reshape(*ids.shape, 3)
+    squares = elements.squared_differences(ids, weights, rows)
+    return float((squares / 2 / chance[twice]).sum() * pixels)
 
 
 def _chances(partition: Partition) -> Doubles:

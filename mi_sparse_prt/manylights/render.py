@@ -22,6 +22,7 @@ from mi_sparse_prt.core.variant import check_variant
 from mi_sparse_prt.manylights.compensation import PATHS, SURVEY, LeftOut, joined, trace_left_out
 from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
+    PIXELS,
     SECOND,
     Estimate,
     Partition,
@@ -248,7 +249,7 @@ class RowColumn:
                 self.elements.sum_columns(columns, weights)
                 took.append((middle - start, time.perf_counter() - middle))
         row, column = (seconds / PILOT for seconds in took[-1])
-        return Costs(row, column * (1 + SECOND), CLUSTERING * len(self.lights))
+        return Costs(row, column * (1 + 2 * SECOND * PIXELS), CLUSTERING * len(self.lights))
 
     def forecast(self, costs: Costs) -> float:
         """Seconds that rows, clustering and columns will take."""
@@ -297,10 +298,8 @@ class RowColumn:
     def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
         """The sum of all columns by those that represent their clusters."""
         rng = self.settings.random(_DRAW)
-        published = self.settings.method == "hasan2007"
-        total = len(partition) if published else round((1 + SECOND) * len(partition))
-        with self.run.clock.phase("columns"), self.run.bar(total, "columns", " columns") as bar:
-            if published:
+        with self.run.clock.phase("columns"), self.run.bar(len(partition), "columns", " columns") as bar:
+            if self.settings.method == "hasan2007":
                 chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
             return sum_with_error(self.elements, partition, self.settings.spp, rng, bar.update)

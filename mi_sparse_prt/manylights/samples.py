@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -185,15 +184,25 @@ class Samples:
         at = mi.Float(np.ascontiguousarray(away - np.float32(offset)).ravel())
         return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
-    def pixel_means(self, values: Floats) -> Floats:
-        """Means (channels, pixels) of what rows add to their pixels, (channels, m); of those pixels that have rows."""
-        sums: Floats = np.add.reduceat(values, self._first_rows, axis=1, dtype=np.float32)
+    def pixel_means(self, values: Floats, rows: Ids) -> Floats:
+        """Means (channels, pixels) of what rows add to their pixels, (channels, r); rows ascend."""
+        first = np.unique(self.ids[rows] // self.spp, return_index=True)[1]
+        sums: Floats = np.add.reduceat(values, first, axis=1, dtype=np.float32)
         return sums / np.float32(self.spp)
 
-    @cached_property
-    def _first_rows(self) -> NDArray[np.int64]:
-        """The first row of each pixel that has some."""
-        return np.unique(self.ids // self.spp, return_index=True)[1]
+    def rows_of_pixels(self, count: int, rng: np.random.Generator) -> tuple[Ids, float]:
+        """All rows of pixels at random, ascending, and of how many pixels each of these is one.
+
+        Parameters
+        ----------
+        count : int
+            Pixels, at most, of those that have rows.
+        rng : np.random.Generator
+        """
+        pixel = self.ids // self.spp
+        every = np.unique(pixel)
+        chosen = rng.choice(every, min(count, len(every)), replace=False)
+        return np.flatnonzero(np.isin(pixel, chosen)), len(every) / max(len(chosen), 1)
 
     def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
         """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.

@@ -13,6 +13,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.many_lights_reference import Reference
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.manylights import elements as elements_module
+from mi_sparse_prt.manylights import estimate as estimate_module
 from mi_sparse_prt.manylights.baselines import all_lights, draw_by_power, instant_radiosity
 from mi_sparse_prt.manylights.elements import Elements, ReducedColumns
 from mi_sparse_prt.manylights.estimate import (
@@ -101,8 +102,9 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
     mixed = matrix.sum_columns(ids * [[1], [0]], twos)  # the second set is four times column 0
     others = whole[:, 0] * weights.sum(axis=0)
     assert mixed == pytest.approx(np.where(own, others, expected), rel=1e-5, abs=1e-7)
-    sums, squares = matrix.sum_pairs(ids, twos)
-    assert sums == pytest.approx(expected / 2, rel=1e-5, abs=1e-7)
+    squares = matrix.squared_differences(ids, twos, np.arange(len(whole)))
+    some, share = matrix.samples.rows_of_pixels(40, np.random.default_rng(0))
+    squares_of_some = matrix.squared_differences(ids, twos, some)
     signs = np.where(own, -1, 1)
     pixel = matrix.samples.ids // 4
     for k, (i, j) in enumerate(((0, 1), (2, 3))):
@@ -113,6 +115,13 @@ def test_rows_columns_blocks_and_sums_are_the_same_matrix(matrix: Elements, whol
         means = np.zeros((256, 3))
         np.add.at(means, pixel, np.where(own, -apart[1], apart[0]) / 4)
         assert squares[k] == pytest.approx((means**2).sum(), rel=1e-4)
+        chosen = np.unique(pixel[some])
+        assert squares_of_some[k] == pytest.approx((means[chosen] ** 2).sum(), rel=1e-4)
+    assert (
+        len(chosen) == 40
+        and share == len(np.unique(pixel)) / 40
+        and np.isin(pixel, chosen).sum() == len(some)
+    )
     assert matrix.sum_of_rows(np.arange(10, 40)) == pytest.approx(whole[10:40].sum(axis=1), rel=1e-5)
 
 
@@ -233,22 +242,25 @@ def test_sets_of_representatives_are_apart() -> None:
     assert found[0].weights == pytest.approx(np.tile([[[8.0], [1.0]]], (4, 1, 3)))
 
 
-@pytest.mark.parametrize("sets", [1, 4])
-def test_the_predicted_error_is_that_of_the_image(matrix: Elements, whole: np.ndarray, sets: int) -> None:
+@pytest.mark.parametrize(("sets", "pixels"), [(1, 1024), (4, 1024), (4, 64)])
+def test_the_predicted_error_is_that_of_the_image(
+    matrix: Elements, whole: np.ndarray, sets: int, pixels: int, monkeypatch
+) -> None:
     """Second representatives tell the expected error, over 200 estimates of one partition, whose mean is the truth.
 
-    Rationale: that error is the sum of the variances of all clusters; a tenth of them is measured, drawn by cost and
-    energy, and counts by the inverse of its chance.
+    Rationale: that error is the sum of the variances of all clusters; half of them are measured, at all pixels or at
+    some, drawn by cost and energy, and count by the inverse of their chance.
     Expected: root mean squares of predicted and true errors of pixels within 15%; both vary by few percent over so many
     seeds. The mean of the estimates is within four standard errors. Four sets have at most 0.7 times the error of one.
     """
-    true, sums = {}, np.zeros(200)
+    monkeypatch.setattr(estimate_module, "FEWEST_PIXELS", pixels)
+    true, sums, every = {}, np.zeros(200), np.arange(len(whole))
     for count in {1, sets}:
         predicted, true[count] = np.zeros(200), np.zeros(200)
         for k, found in enumerate(estimates_with_error(matrix, whole, count)):
             off = found.values - whole.sum(axis=1)
             predicted[k] = found.squared_error
-            true[count][k] = (matrix.samples.pixel_means(off.T) ** 2).sum()
+            true[count][k] = (matrix.samples.pixel_means(off.T, every) ** 2).sum()
             sums[k] = found.values.sum()
         assert abs(sums.mean() - whole.sum()) < 4 * sums.std() / np.sqrt(200) < 0.02 * whole.sum()
         assert np.sqrt(predicted.mean() / true[count].mean()) == pytest.approx(1, abs=0.15)
@@ -269,12 +281,14 @@ def estimates_with_error(matrix: Elements, whole: np.ndarray, sets: int) -> Iter
     def sum_columns(ids, weights, done):
         return sum(each(ids, weights), np.zeros_like(columns[:, 0]))
 
-    def sum_pairs(ids, weights, done):
-        every = np.array(list(each(ids, weights)))
-        apart = [matrix.samples.pixel_means(pair.T) for pair in every[::2] - every[1::2]]
-        return every.sum(axis=0) / 2, np.array([(pixels**2).sum() for pixels in apart])
+    def squared_differences(ids, weights, rows):
+        every = np.array(list(each(ids, weights)))[:, rows]
+        apart = [matrix.samples.pixel_means(pair.T, rows) for pair in every[::2] - every[1::2]]
+        return np.array([(pixels**2).sum() for pixels in apart])
 
-    twin = SimpleNamespace(sum_columns=sum_columns, sum_pairs=sum_pairs)
+    twin = SimpleNamespace(
+        sum_columns=sum_columns, squared_differences=squared_differences, samples=matrix.samples
+    )
     for k in range(200):
         yield sum_with_error(twin, partition, sets, np.random.default_rng(k))
 
