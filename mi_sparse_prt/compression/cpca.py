@@ -18,12 +18,16 @@ ITERATIONS = 1  # of assigning and fitting, for each basis vector
 SETTLING = 4  # of them, at the beginning without basis vectors, and at the end with all
 CANDIDATES = 4  # clusters that an item may go to until all are compared again ...
 COMPARED = 6  # ... which is when this many basis vectors were added
+SHORT = (
+    1024  # elements of vectors that a compiled loop makes orthonormal sooner than calls of BLAS and LAPACK do
+)
 MORE = 4  # vectors that the search for principal components carries along
 BLOCK = 1 << 22  # products with all clusters at a time
 NEGLIGIBLE = 1e-6  # of the first singular value: what is smaller is rounding
 COUNTED = 1e6  # squares of singular values within this factor of it are looked at twice
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -219,7 +223,7 @@ def affine_space(
         vectors = _added(np.concatenate((start, mixed)), none)
         vectors = _combined(rows, roots, mean, _weighted(roots, _along(rows, mean, vectors)))
     vectors = _added(vectors, none)
-    turned = _principal(_weighted(roots, _along(rows, mean, vectors)), bases, _largest(rows))
+    turned = _principal(_weighted(roots, _along(rows, mean, vectors)), bases, rows)
     return mean, np.dot(turned, vectors)
 
 
@@ -250,14 +254,14 @@ def refined_space(
     if len(rows) <= bases + MORE:
         vectors = _added(_combined(rows, roots, mean, np.eye(len(rows), dtype=np.float32)), none)
         along = _along(rows, mean, vectors)
-        turned = _principal(_weighted(roots, along), bases, _largest(rows))
+        turned = _principal(_weighted(roots, along), bases, rows)
         return mean, np.dot(turned, vectors), np.dot(along, turned.T)
     first = _added(_combined(rows, roots, mean, _weighted(roots, products)), none)
     along = _along(rows, mean, first)
     second = _added(_combined(rows, roots, mean, _weighted(roots, along)), first)
     more = _along(rows, mean, second)
     both = np.concatenate((along, more), axis=1)
-    turned = _principal(_weighted(roots, both), bases, _largest(rows))
+    turned = _principal(_weighted(roots, both), bases, rows)
     one, other = np.ascontiguousarray(turned[:, : len(first)]), np.ascontiguousarray(turned[:, len(first) :])
     return mean, np.dot(one, first) + np.dot(other, second), np.dot(both, turned.T)
 
@@ -295,10 +299,50 @@ def _added(vectors: Floats, basis: Floats) -> Floats:
     least = NEGLIGIBLE**2 * np.square(wide).sum()
     for _ in range(2 if len(old) else 0):  # the second time for what rounding left
         wide -= np.dot(np.dot(wide, old.T), old)
+    if wide.shape[1] <= SHORT:
+        return _orthonormalised(wide, max(least, 1e-36))
     squares, turn = np.linalg.eigh(np.dot(wide, wide.T))
     kept = (squares > max(least, 1e-36)).sum()
     turn = turn[:, len(squares) - kept :] / np.sqrt(squares[len(squares) - kept :])
     return np.dot(np.ascontiguousarray(turn.T), wide).astype(np.float32)
+
+
+@numba.njit(nogil=True, fastmath=True, cache=True)
+def _orthonormalised(vectors: Doubles, least: float) -> Floats:
+    """Gram-Schmidt, modified, the longest of what is left first: (at most b, m) of (b, m), which are overwritten.
+
+    Those of which no more than ``least`` is left, squared, are left out.
+    """
+    b, m = vectors.shape
+    squares = np.empty(b)
+    for i in range(b):
+        squares[i] = 0.0
+        for j in range(m):
+            squares[i] += vectors[i, j] * vectors[i, j]
+    found = np.empty((b, m), np.float32)
+    for k in range(b):
+        longest = k
+        for i in range(k + 1, b):
+            if squares[i] > squares[longest]:
+                longest = i
+        if squares[longest] <= least:
+            return found[:k]
+        scale = 1 / np.sqrt(squares[longest])
+        for j in range(m):
+            unit = scale * vectors[longest, j]
+            vectors[longest, j] = vectors[k, j]
+            vectors[k, j] = unit
+            found[k, j] = unit
+        squares[longest] = squares[k]
+        for i in range(k + 1, b):
+            along, left = 0.0, 0.0
+            for j in range(m):
+                along += vectors[k, j] * vectors[i, j]
+            for j in range(m):
+                vectors[i, j] -= along * vectors[k, j]
+                left += vectors[i, j] * vectors[i, j]
+            squares[i] = left
+    return found
 
 
 def _largest(rows: Floats) -> float:
@@ -306,16 +350,16 @@ def _largest(rows: Floats) -> float:
     return max(float(rows.max()), -float(rows.min()))
 
 
-def _principal(products: Floats, bases: int, largest: float) -> Floats:
+def _principal(products: Floats, bases: int, rows: Floats) -> Floats:
     """Combinations (at most ``bases``, b) of orthonormal vectors that are principal components.
 
-    products : (n, b), of weighted deviations with the vectors; largest : of the rows' elements.
+    products : (n, b), of weighted deviations with the vectors; rows : (n, m), whose size tells what is rounding.
     """
     wide = products.astype(np.float64)
     values, turn = np.linalg.eigh(np.dot(wide.T, wide))
     least = NEGLIGIBLE**2 * (values.max() if len(values) else 0.0)
     if (values <= COUNTED * least).any() or len(values) < bases:  # what rounding leaves of equal rows
-        least = max(least, NEGLIGIBLE**2 * largest**2)
+        least = max(least, NEGLIGIBLE**2 * _largest(rows) ** 2)
     kept = min(bases, (values > least).sum())  # the last ones
     return np.ascontiguousarray(turn[:, len(values) - kept :][:, ::-1].T.astype(np.float32))
 
