@@ -5,6 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.stats
 from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import assert_one_line_error, call, entries
 from test_many_lights import LAMP, room
@@ -58,7 +59,8 @@ def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
     """A room whose lamp, which the camera sees, and point are dimmed and coloured; in the picture, and in the scene.
 
     Rationale: all light is linear in what emitters send out, and no cluster has lights of two of them.
-    Expected: of 8 seeds, means of the picture's colours agree within 3 standard errors; pictures differ (RMS) by less
+    Expected: of 8 seeds, means of the picture's colours agree within what is as likely as 3 standard errors, by
+    Student's t, as these are estimated from so few (of 64 seeds they differ by 0.13 +- 0.07%); pictures differ (RMS) by less
     than 1.5%, and with all columns (of three) by less than 0.5%, as particles and points on the lamp are others; the
     lamp's face is as bright.
     """
@@ -87,7 +89,7 @@ def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
     means = difference.mean(axis=(1, 2))
     z = means.mean(axis=0) / (means.std(axis=0, ddof=1) / np.sqrt(8))
     print(f"z {z.round(2)}, differences {apart:.2%}, with all columns {lights:.2%}")
-    assert np.abs(z).max() < 3
+    assert np.abs(z).max() < scipy.stats.t(7).isf(scipy.stats.norm.sf(3))
     assert apart < 0.015 and lights < 0.005
     face = np.argmin(np.abs(changed[0] - [1.2, 2.5, 6]).sum(axis=-1))
     assert_allclose(mixed[0].reshape(-1, 3)[face], [1.2, 2.5, 6], rtol=1e-5)
