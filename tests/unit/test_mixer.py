@@ -60,9 +60,9 @@ def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
 
     Rationale: all light is linear in what emitters send out, and no cluster has lights of two of them.
     Expected: of 8 seeds, means of the picture's colours agree within what is as likely as 3 standard errors, by
-    Student's t, as these are estimated from so few (of 64 seeds they differ by 0.13 +- 0.07%); pictures differ (RMS) by less
-    than 1.5%, and with all columns (of three) by less than 0.5%, as particles and points on the lamp are others; the
-    lamp's face is as bright.
+    Student's t, as these are estimated from so few (of 64 seeds they differ by 0.13 +- 0.07%); pictures differ
+    (RMS) by less than 1.5%, and with all columns (of three) by less than 0.5%, as particles and points on the lamp are
+    others; the lamp's face is as bright.
     """
     weights = {"lamp": (0.2, 0.5, 1.5), "point": 4.0}
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": [6 * 0.2, 5 * 0.5, 4 * 1.5]}}
