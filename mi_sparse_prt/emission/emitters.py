@@ -81,6 +81,12 @@ class SceneEmitters:
         return len(self.names)
 
     @property
+    def unmet(self) -> NDArray[np.int64]:
+        """Columns (k,) of points, spots and suns, which no ray can meet, and of groups that have some."""
+        delta = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in self._scene.emitters()]
+        return np.flatnonzero([any(delta[number] for number in own) for own in self._members])
+
+    @property
     def weights(self) -> NDArray[np.float32]:
         """Of lamps in inner products: all count the same."""
         return np.ones(self.size, np.float32)

@@ -72,6 +72,10 @@ class EmissionSpace(Protocol):
 class SampledEmission(EmissionSpace, Protocol):
     """A basis whose elements are sampled from where their light arrives; its light need not be distant."""
 
+    @property
+    def unmet(self) -> NDArray[np.int64]:
+        """Elements (k,) that have light of points or of single directions, which no ray can meet; ascending."""
+
     def sample(self, element: Any, position: Any, uv: Any, /) -> tuple[Any, Any, Any]:
         """One direction in which light of an element arrives, on the device.
 

@@ -197,9 +197,8 @@ class Elements:
         for a in range(0, len(squares), step := max(1, LANES // len(rows))):
             count = min(step, len(squares) - a)
             found = self._differences(chosen, place, a, count).numpy().reshape(3, count, len(rows))
-            for k in range(count):
-                means = self.samples.pixel_means(found[:, k], np.asarray(rows, np.int64))
-                squares[a + k] = np.square(means, dtype=np.float64).sum()
+            means = self.samples.pixel_means(found, rows)
+            squares[a : a + count] = np.square(means, dtype=np.float64).sum(axis=(0, 2))
         self.evaluated += len(rows) * total
         return squares
 

@@ -184,10 +184,10 @@ class Samples:
         at = mi.Float(np.ascontiguousarray(away - np.float32(offset)).ravel())
         return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
-    def pixel_means(self, values: Floats, rows: Ids) -> Floats:
-        """Means (channels, pixels) of what rows add to their pixels, (channels, r); rows ascend."""
+    def pixel_means(self, values: Floats, rows: NDArray[np.integer]) -> Floats:
+        """Means (..., pixels) of what rows add to their pixels, (..., r); rows ascend."""
         first = np.unique(self.ids[rows] // self.spp, return_index=True)[1]
-        sums: Floats = np.add.reduceat(values, first, axis=1, dtype=np.float32)
+        sums: Floats = np.add.reduceat(values, first, axis=-1, dtype=np.float32)
         return sums / np.float32(self.spp)
 
     def rows_of_pixels(self, count: int, rng: np.random.Generator) -> tuple[Ids, float]:

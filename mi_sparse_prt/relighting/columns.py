@@ -114,10 +114,10 @@ def _norms(
     for j in range(first, last):
         total = 0.0
         for block in range(blocks):
-            first = block * BLOCK
+            before = block * BLOCK
             for e in range(starts[block, j], starts[block, j + 1]):
                 row, channel = divmod(int(places[e]), channels)
-                total += (half_float(halves[e]) * scales[first + row, channel]) ** 2
+                total += (half_float(halves[e]) * scales[before + row, channel]) ** 2
         norms[j] = np.sqrt(total)
 
 

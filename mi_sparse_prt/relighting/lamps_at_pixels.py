@@ -45,6 +45,8 @@ class LampLitIntegrator(RelitIntegrator):
         self._rough_glass = relit[-1].rough_glass
         met = has_mirrors(scene) and any(shape.is_emitter() for shape in scene.shapes())
         self._caustics = met or bool(self._rough_glass)
+        delta = mi.EmitterFlags.Delta
+        self._unmet = any(mi.has_flag(emitter.flags(), delta) for emitter in scene.emitters())
 
     def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         value, valid = super()._radiance(ray, sampler, active)
@@ -84,9 +86,9 @@ class LampLitIntegrator(RelitIntegrator):
             met = self._scene.ray_intersect(ray, active)
             lit = active & (way.depth > depth)
             radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
-            if not self._rough_glass:
-                return Seen(radiance, met, mi.Mask(False))
             rough = active & is_one_of(self._rough_glass, met)
+            if not self._rough_glass or not self._unmet:
+                return Seen(radiance, met, rough)
             asked = rough & ~way.last
             there, light = self._scene.sample_emitter_direction(met, sampler.next_2d(asked), True, asked)
             asked &= there.delta

@@ -152,21 +152,23 @@ def lamp_met(problem: Problem, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Int32
 def lamp_asked(
     problem: Problem, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Mask
 ) -> tuple[mi.UInt32, mi.Vector3f, mi.Color3f]:
-    """A lamp at random that no ray can meet, a point or a sun, asked by a shadow ray from surfaces (normalised frame).
+    """A lamp at random of those that no ray can meet, asked by a shadow ray from surfaces (normalised frame).
 
     Its column, the direction, and its irradiance at right angles to that, as if it was all of them; 0 where it is
-    hidden, or is a lamp that rays meet.
+    hidden, or of another kind in the same column.
     """
     lamps, scene = problem.emission, problem.scene
-    chosen = mi.UInt32(rng.next_float32() * lamps.size)
-    lamp = dr.minimum(chosen, dr.opaque(mi.UInt32, lamps.size - 1))
+    unmet = mi.UInt32(lamps.unmet.astype(np.uint32))
+    count = dr.opaque(mi.UInt32, len(unmet))
+    place = dr.minimum(mi.UInt32(rng.next_float32() * mi.Float(count)), count - 1)
+    lamp = dr.gather(mi.UInt32, unmet, place, active)
     uv = mi.Point2f(rng.next_float32(), rng.next_float32())
     towards, irradiance, distance = lamps.sample(lamp, to_world(scene, si.p), uv)
     lit = active & ~scene.normalised.ray_test(
         si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active
     )
     met, _ = lamp_met(problem, si.spawn_ray(towards), lit)
-    return lamp, towards, dr.select(lit & (met != mi.Int32(lamp)), irradiance * lamps.size, 0)
+    return lamp, towards, dr.select(lit & (met != mi.Int32(lamp)), irradiance * mi.Float(count), 0)
 
 
 def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:

@@ -106,6 +106,7 @@ class SpecularChains:
         self._rough_glass = problem.scene.rough_glass
         self._points = PointArrays(problem.points)
         self._of_sky, self._size = isinstance(problem.emission, CubemapLighting), problem.emission.size
+        self._asks = not self._of_sky and bool(self._rough_glass) and len(problem.emission.unmet) > 0
         depth, self._apart = problem.max_depth, problem.depths_apart
         self._longest = LONGEST if depth < 0 else min(depth - 2, LONGEST)
 
@@ -262,7 +263,7 @@ class SpecularChains:
                 return
             si = hit.compute_surface_interaction(ray, active=hit.is_valid())
             goes_on = hit.is_valid() & self._is_specular(si) & (dr.max(weight) > 0)
-            if to_light and self._rough_glass and not self._of_sky:
+            if to_light and self._asks:
                 yield self._of_lamps_asked(si, of, weight, rng, goes_on)
             scattered, share = self._scattered(si, rng, goes_on)
             weight = dr.select(goes_on, weight * share, 0)

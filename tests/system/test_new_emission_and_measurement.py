@@ -31,6 +31,7 @@ class PointLights:
 
     def __init__(self, positions: NDArray[np.float32]) -> None:
         self.positions, self.size = positions, len(positions)
+        self.unmet = np.arange(self.size)
         self.weights = np.ones(self.size, np.float32)
         self.coordinates = dict(zip("xyz", positions.T, strict=True))
         self._positions = mi.Point3f(np.ascontiguousarray(positions.T))
