@@ -71,7 +71,7 @@ def _rank(transport: LightTransport) -> Colouring | str:
     operator = transport.operators.get("compressed")
     if isinstance(operator, Clustered):
         ranks = cluster_ranks(operator)[_labels(transport, operator)]
-        words = f"of {operator.bases.shape[1]} basis vectors hold {HELD:.0%}"
+        words = f"of {operator.bases.shape[1]} basis vectors hold {HELD:.0%} of the energy"
     elif isinstance(operator, HaarRows):
         ranks = np.diff(operator.starts[:: operator.scales.shape[1]])
         words = "wavelet coefficients were kept"
