@@ -7,6 +7,7 @@ wall has corners on both sides of it; what lies on one side is lit by the corner
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from weakref import WeakKeyDictionary
 
 import drjit as dr
@@ -33,7 +34,8 @@ def hidden_corners(scene: Scene) -> HiddenCorners:
 class HiddenCorners:
     """Which corners of its triangle a wall hides from a point on it.
 
-    Triangles are those of all shapes, shape after shape; points and normals are in the normalised frame.
+    Triangles are those of all shapes, shape after shape; points and normals are in the normalised frame, or as
+    ``in_world`` says.
 
     Parameters
     ----------
@@ -51,7 +53,7 @@ class HiddenCorners:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene.normalised
+        self._scene, self._unit = scene.normalised, 1.0
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self._corners = mi.Point3f(vertex_points(scene).positions[triangles.ravel()].T)
         cut = np.zeros(len(triangles), bool)
@@ -61,6 +63,18 @@ class HiddenCorners:
             cut[part] = self._crossed(index).numpy()
         self.some = bool(cut.any())
         self._cut = mi.Bool(cut)
+
+    def in_world(self, scene: Scene) -> HiddenCorners:
+        """The same for points in world space, for rays that are traced there: a kernel on a GPU has one scene only.
+
+        Parameters
+        ----------
+        scene : Scene
+        """
+        found = copy(self)
+        found._scene, found._corners = scene.mitsuba, scene.to_world(self._corners)
+        found._unit = 1 / scene.scale
+        return found
 
     def weights(
         self,
@@ -155,7 +169,7 @@ class HiddenCorners:
 
     def _blocked(self, start: mi.Point3f, end: mi.Point3f, normal: mi.Vector3f, active: mi.Mask) -> mi.Mask:
         """Whether something is in the way from a point to a corner, just above the triangle that both are on."""
-        lifted = dr.fma(normal, ray_offset(start), start)
+        lifted = dr.fma(normal, ray_offset(start, self._unit), start)
         ray = mi.Ray3f(lifted, end - start)
         ray.maxt = mi.Float(SHORT)
         return self._scene.ray_test(ray, active)

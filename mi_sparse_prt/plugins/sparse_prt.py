@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -149,7 +150,9 @@ class SparsePRT(mi.SamplingIntegrator):
         active: mi.Mask = True,
     ) -> tuple[mi.Color3f, mi.Mask, list[mi.Float]]:
         """What integrators around this one ask for, ``aov`` and ``moment``; see ``render``."""
-        return self._looking_at(scene).sample(scene, sampler, ray, medium, active)
+        radiance, valid, others = self._looking_at(scene).sample(scene, sampler, ray, medium, active)
+        dr.eval(radiance, valid)  # on a GPU a kernel traces rays in one scene only, and theirs is another one
+        return radiance, valid, others
 
     def _looking_at(self, scene: mi.Scene) -> mi.SamplingIntegrator:
         """The integrator that looks at the relit surfaces of a scene, or the reference."""

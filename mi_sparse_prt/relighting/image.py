@@ -91,7 +91,7 @@ class RelitScene:
         self._backs = mi.Int32(scene.backs.astype(np.int32))
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
         self._first_triangle = first_triangles(self._scene)
-        self._hidden, self._centre, self._scale = hidden_corners(scene), mi.Point3f(scene.centre), scene.scale
+        self._hidden = hidden_corners(scene).in_world(scene)
 
     def radiance(
         self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask, hide_background: bool = False
@@ -165,8 +165,7 @@ class RelitScene:
         ]
         weights = [1 - u - v, u, v]
         if self._hidden.some:
-            place = (si.p - self._centre) * self._scale
-            weights = self._hidden.weights(triangle, place, ray.d, weights, valid)
+            weights = self._hidden.weights(triangle, si.p, ray.d, weights, valid)
         return list(zip(vertices, weights, strict=True)), valid
 
     def footprint(self, ray: mi.Ray3f, u: mi.Point2f) -> tuple[list[Share], mi.Mask, mi.Mask]:
@@ -349,6 +348,7 @@ class RelitIntegrator(mi.SamplingIntegrator):
         ray, active = mi.Ray3f(ray), mi.Mask(active)
         if self._hide_emitters:
             ray = past_lamps(scene, ray, active)
+            dr.eval(ray)  # on a GPU a kernel traces rays in one scene only
         value, valid = self._radiance(ray, sampler, active)
         return value, valid, []
 

@@ -52,6 +52,10 @@ class LampLitIntegrator(RelitIntegrator):
         value, valid = super()._radiance(ray, sampler, active)
         for relit in self._more:
             value += relit.radiance(ray, sampler, active)[0]
+        sampler.schedule_state()
+        dr.eval(
+            value, valid, ray
+        )  # on a GPU a kernel traces rays in one scene only, and what follows is another one
         if self._goes_on:
             direct, _ = follow(self._seen, ray, sampler, active, self._max_depth)
         else:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def ray_offset(p: mi.Point3f) -> mi.Float:
-    """Along the normal at points on the device."""
-    return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
+def ray_offset(p: mi.Point3f, unit: float = 1.0) -> mi.Float:
+    """Along the normal at points on the device, in a frame in which the scene has the size ``unit``."""
+    return (unit + dr.max(dr.abs(p))) * mi.math.RayEpsilon
 
 
 def ray_offsets(positions: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene
+from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.traversal import places_of_lamps
@@ -194,6 +196,22 @@ class Scene:
                 self.mitsuba.shapes(), self._surfaces, self.materials[: len(self.fronts)], strict=True
             )
         ]
+
+    def to_world(self, p: mi.Point3f) -> mi.Point3f:
+        """Points of the normalised frame in world space, on the device."""
+        return p / self.scale + mi.Point3f(*map(float, self.centre))
+
+    def shape_in_world(self, shape: mi.ShapePtr, active: mi.Mask) -> mi.ShapePtr:
+        """The shapes of ``mitsuba``, which have emitters, in place of those of ``normalised``.
+
+        A kernel on a GPU can trace rays in one scene only: what rays of ``normalised`` meet is looked up.
+        """
+        return dr.reinterpret_array(mi.ShapePtr, self._shapes_in_world.gather(shape, active))
+
+    @cached_property
+    def _shapes_in_world(self) -> ShapeTable:
+        pointers = dr.reinterpret_array(mi.UInt32, self.mitsuba.shapes_dr())
+        return ShapeTable(self.normalised, pointers.numpy())
 
     def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
         """One of the scene's own cameras by its number; a sensor is passed on.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, has_mirrors, trace_reflected
 from mi_sparse_prt.solvers.problem import Problem
@@ -84,7 +83,7 @@ class LampRays:
             (mi.Float(stratum - row * self._strata) + rng.next_float32()) / self._strata,
             (mi.Float(row) + rng.next_float32()) / self._strata,
         )
-        position = to_world(self._scene, self._points.position(point))
+        position = self._scene.to_world(self._points.position(point))
         direction, irradiance, distance = self._emission.sample(lamp, position, uv)
         cosine = dr.dot(self._points.normal(point), direction)
         lit = (cosine > 0) & (dr.max(irradiance) > 0)
@@ -129,11 +128,11 @@ class LampPaths(PathSolver):
 
         def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
             uv = mi.Point2f(rng.next_float32(), rng.next_float32())
-            direction, irradiance, distance = self._emission.sample(texel, to_world(self._world, si.p), uv)
+            direction, irradiance, distance = self._emission.sample(texel, self._world.to_world(si.p), uv)
             return direction, irradiance, distance * self._world.scale
 
-        def met(ray: mi.Ray3f, active: mi.Mask) -> mi.Color3f:
-            lamp, radiance = lamp_met(self.problem, ray, active)
+        def met(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Color3f:
+            lamp, radiance = lamp_met(self.problem, si, ray, active)
             return dr.select(active & (lamp == mi.Int32(texel)), radiance, 0)
 
         light = Light(sample, scattered=True, rough_glass=self._world.rough_glass)
@@ -142,11 +141,14 @@ class LampPaths(PathSolver):
         return trace_reflected(self.scene, ray, light, rng, bounces)
 
 
-def lamp_met(problem: Problem, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Int32, mi.Color3f]:
-    """The lamp that rays (normalised frame) meet, -1 for none, and its radiance."""
-    world = mi.Ray3f(to_world(problem.scene, ray.o), ray.d)
-    si = problem.scene.mitsuba.ray_intersect(world, active)
-    return problem.emission.element_of(si, world, active)
+def lamp_met(
+    problem: Problem, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
+) -> tuple[mi.Int32, mi.Color3f]:
+    """The lamp at what rays meet (both of the normalised frame), -1 for none, and its radiance."""
+    scene = problem.scene
+    there = mi.SurfaceInteraction3f(si)
+    there.p, there.shape = scene.to_world(si.p), scene.shape_in_world(si.shape, active & si.is_valid())
+    return problem.emission.element_of(there, mi.Ray3f(scene.to_world(ray.o), ray.d), active)
 
 
 def lamp_asked(
@@ -163,17 +165,13 @@ def lamp_asked(
     place = dr.minimum(mi.UInt32(rng.next_float32() * mi.Float(count)), count - 1)
     lamp = dr.gather(mi.UInt32, unmet, place, active)
     uv = mi.Point2f(rng.next_float32(), rng.next_float32())
-    towards, irradiance, distance = lamps.sample(lamp, to_world(scene, si.p), uv)
+    towards, irradiance, distance = lamps.sample(lamp, scene.to_world(si.p), uv)
     lit = active & ~scene.normalised.ray_test(
         si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active
     )
-    met, _ = lamp_met(problem, si.spawn_ray(towards), lit)
+    ray = si.spawn_ray(towards)
+    met, _ = lamp_met(problem, scene.normalised.ray_intersect(ray, lit), ray, lit)
     return lamp, towards, dr.select(lit & (met != mi.Int32(lamp)), irradiance * mi.Float(count), 0)
-
-
-def to_world(scene: Scene, p: mi.Point3f) -> mi.Point3f:
-    """Points of the normalised frame in world space."""
-    return p / scene.scale + mi.Point3f(*map(float, scene.centre))
 
 
 def ray_to(ray: mi.Ray3f, place: mi.Point3f) -> mi.Ray3f:

@@ -208,7 +208,7 @@ class Light:
     radiance: mi.Float | None = None
     scattered: bool = False
     rough_glass: Sequence[mi.BSDF] = ()
-    met: Callable[[mi.Ray3f, mi.Mask], mi.Color3f] | None = None
+    met: Callable[[mi.SurfaceInteraction3f, mi.Ray3f, mi.Mask], mi.Color3f] | None = None
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
@@ -241,7 +241,7 @@ def trace_reflected(
             escaped = active & mirrored & counts & ~si.is_valid()
             result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
         if light.met is not None:
-            found = light.met(ray, active & mirrored & counts)
+            found = light.met(si, ray, active & mirrored & counts)
             result += dr.select(active & mirrored & counts, throughput * found, 0)
         active &= si.is_valid() & (depth < bounces)
 

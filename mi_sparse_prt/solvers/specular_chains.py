@@ -303,7 +303,9 @@ class SpecularChains:
         if self._of_sky:
             texel = texel_at(*face_coordinates(ray.d), self._problem.emission.resolution)
             return dr.select(active & ~hit.is_valid(), texel, NOTHING), mi.Color3f(1)
-        lamp, radiance = lamp_met(self._problem, ray, active)
+        lamp, radiance = lamp_met(
+            self._problem, hit.compute_surface_interaction(ray, active=active), ray, active
+        )
         return dr.select(lamp >= 0, mi.UInt32(lamp), NOTHING), radiance
 
     def _scattered(

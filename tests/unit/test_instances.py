@@ -45,6 +45,8 @@ def check_hits(original: mi.Scene, scene: Scene, missed: float, off: float, text
     """
     ray = rays_at(original.bbox())
     a, b = original.ray_intersect(ray), scene.mitsuba.ray_intersect(ray)
+    dr.eval(a)  # on a GPU a kernel traces rays in one scene only
+    dr.eval(b)
     hit, same = a.is_valid().numpy(), b.is_valid().numpy()
     assert hit.mean() > 0.02
     assert (hit != same).mean() < missed * hit.mean()
