@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import drjit as dr
 import psutil
 
 from mi_sparse_prt.core.profiling import versions
+from mi_sparse_prt.core.variant import variant
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.scene.scene import Scene
 
@@ -72,11 +74,23 @@ def describe_machine() -> dict[str, Any]:
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "drjit_threads": dr.thread_count(),
+        "gpu": _gpu_model(),
         "memory_bytes": psutil.virtual_memory().total,
         "load_average": os.getloadavg()[0],
         "system": platform.platform(),
         "versions": versions(),
     }
+
+
+def _gpu_model() -> str | None:
+    """The GPU that kernels run on, None if they run on the processor."""
+    if variant() != "cuda_ad_rgb":
+        return None
+    asked = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.splitlines()[0]
+    except (OSError, subprocess.CalledProcessError, IndexError):
+        return "a GPU whose name nvidia-smi does not tell"
 
 
 def _cpu_model() -> str:

@@ -45,6 +45,7 @@ def benchmark_tables(report: dict[str, Any]) -> list[Table]:
         (coarse, duration(relit["with_indirect"]["seconds"])),
     ]
     processor = f"{machine['cpu']}, {machine['cores']} cores, {machine['drjit_threads']} Dr.Jit threads"
+    processor += f"; {machine['gpu']}" if machine["gpu"] else ""
     host = [
         ("processor", processor),
         ("load average (over the cores: disturbed)", f"{machine['load_average']:.1f}"),
