@@ -4,7 +4,8 @@
 
 Precomputes and compresses the scene's matrix (resolution 32), then streams 8760 skies to a callback, that takes the
 colours block by block and keeps the mean. Skies are brightest around a sun at 45 degrees north, the ground is grey.
-Prints JSON: what making the skies and the callback take is told apart from ``relight``. Nothing else should run beside it.
+Prints JSON: what making the skies and the callback take is told apart from ``relight``. Nothing else should run
+beside it.
 """
 
 from __future__ import annotations

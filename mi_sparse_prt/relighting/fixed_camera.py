@@ -6,6 +6,7 @@ pixels see any: what is dear in a picture, rays and BRDFs, does not depend on th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,10 +15,10 @@ import mitsuba as mi
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_matrix
 from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.core.threads import run_overlapped
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import Environment
 from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
@@ -84,10 +85,9 @@ class FixedCamera:
         rows = _rows(self._transport)
         samples = _Samples(camera, int(np.ceil(np.sqrt(spp))), seed)
         lines = max(1, SAMPLES_PER_BLOCK // (width * samples.spp))
-        parts = [
-            _block(relit, samples, np.arange(first, min(first + lines, height)), rows)
-            for first in tqdm(range(0, height, lines), desc="pixels", unit=" blocks", disable=not progress)
-        ]
+        bar = tqdm(range(0, height, lines), desc="pixels", unit=" blocks", disable=not progress)
+        blocks = (_block(relit, samples, np.arange(a, min(a + lines, height)), rows) for a in bar)
+        parts = list(run_overlapped(blocks))
         self._pixels = _Sums.joined([part[0] for part in parts])
         directions = np.concatenate([part[2] for part in parts], axis=1)
         self._directions = mi.Vector3f(directions)
@@ -225,10 +225,12 @@ class _Samples:
     def _places_in_pixels(self, random: Floats) -> tuple[Floats, Floats]:
         """Offsets (..., spp, 2), in pixels, and weights (..., spp) whose sum is 1 for each pixel."""
         cell = np.stack(np.divmod(np.arange(self.spp), self._strata), axis=1)
-        steps = (cell + random) * np.float32(STEPS / self._strata)
+        steps = (cell.astype(np.float32) + random) * np.float32(STEPS / self._strata)
         low = np.minimum(steps.astype(np.int32), STEPS - 1)
         offsets = self._places[low] + (steps - low) * (self._places[low + 1] - self._places[low])
-        inside = (offsets / self._radius + 1) * (STEPS / 2)
+        if (self._signs > 0).all():
+            return offsets.astype(np.float32), np.full(offsets.shape[:-1], 1 / self.spp, np.float32)
+        inside = (offsets / np.float32(self._radius) + 1) * np.float32(STEPS / 2)
         signs = self._signs[np.clip(inside.astype(np.int32), 0, STEPS - 1)].prod(axis=-1)
         total = signs.sum(axis=-1, keepdims=True)
         weights = np.divide(signs, total, out=np.full_like(signs, 1 / self.spp), where=total > 0)
@@ -246,40 +248,83 @@ def _rows(transport: LightTransport) -> Ints:
     return rows
 
 
-def _block(relit: RelitScene, samples: _Samples, lines: Ints, rows: Ints) -> tuple[_Sums, _Sums, Floats]:
-    """Sums over vertices and over rays that leave, for some lines, and the directions (3, k) of these rays."""
+def _block(
+    relit: RelitScene, samples: _Samples, lines: Ints, rows: Ints
+) -> Callable[[], tuple[_Sums, _Sums, Floats]]:
+    """Sums over vertices and over rays that leave, for some lines, and the directions (3, k) of these rays.
+
+    What is left to do is a call, which needs no Dr.Jit.
+    """
     ray, u, weights = samples.rays(lines)
     shares, lit, leaves = relit.footprint(ray, u)
     dr.eval(shares, lit, leaves)
-    own = np.arange(len(weights)) // samples.spp
-    n_pixels = len(weights) // samples.spp
-    sums = _collected(shares, np.array(lit), own, weights, rows, n_pixels)
     away = np.flatnonzero(np.array(leaves))
-    starts = np.concatenate([[0], np.cumsum(np.bincount(own[away], minlength=n_pixels))])
-    beyond = _Sums(starts, np.arange(len(away), dtype=np.int32), weights[away])
-    return sums, beyond, np.array(ray.d)[:, away]
-
-
-def _collected(
-    shares: list[Any], lit: NDArray[np.bool_], own: Ints, scale: Floats, rows: Ints, n_pixels: int
-) -> _Sums:
-    """Shares of samples, summed for each pixel and row of the matrix."""
-    at, vertices, values = [], [], []
-    seen = np.flatnonzero(lit)
+    directions = np.array(ray.d)[:, away]
+    corners = list({id(vertex): vertex for _, vertex, _ in shares}.values())
+    known = np.stack([np.array(vertex) for vertex in corners]), np.array(lit)
+    values = np.empty((len(corners), len(rows), 3, len(weights)), np.float32)
     for term, vertex, weight in shares:
-        row, value = rows[term][np.array(vertex)[seen]], np.array(weight).T[seen] * scale[seen]
-        kept = (row >= 0) & (value != 0).any(axis=1)
-        at.append(own[seen[kept]])
-        vertices.append(row[kept])
-        values.append(value[kept])
-    place = np.concatenate(at), np.concatenate(vertices)
-    value = np.concatenate(values)
-    channels = [csr_matrix((value[:, c], place), (n_pixels, int(rows.max()) + 1)) for c in range(3)]
-    return _Sums(
-        channels[0].indptr.astype(np.int64),
-        channels[0].indices.astype(np.int32),
-        np.stack([channel.data for channel in channels], axis=1).astype(np.float32),
-    )
+        corner = next(k for k, some in enumerate(corners) if some is vertex)
+        values[corner, term] = np.array(weight)
+
+    def collect() -> tuple[_Sums, _Sums, Floats]:
+        n_pixels = len(weights) // samples.spp
+        sums = _Sums(*_collected(*known, values, weights, rows, samples.spp))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(away // samples.spp, minlength=n_pixels))])
+        return sums, _Sums(starts, np.arange(len(away), dtype=np.int32), weights[away]), directions
+
+    return collect
+
+
+@numba.njit(nogil=True, cache=True)
+def _collected(
+    vertices: NDArray[np.uint32], lit: NDArray[np.bool_], values: Floats, scale: Floats, rows: Ints, spp: int
+) -> tuple[Ints, NDArray[np.int32], Floats]:
+    """Shares of samples, summed for each pixel and row of the matrix: starts, places and values of ``_Sums``.
+
+    Parameters
+    ----------
+    vertices : (corners, samples) uint32
+    lit : (samples,) bool
+    values : (corners, 1 + K, 3, samples) float32
+    scale : (samples, 3) float32
+    rows : (1 + K, n_v) int64
+        -1 where a vertex has no such row.
+    spp : int
+    """
+    corners, terms = values.shape[0], values.shape[1]
+    n_pixels = len(lit) // spp
+    starts, size = np.zeros(n_pixels + 1, np.int64), 0
+    places, found = np.empty(16 * n_pixels, np.int32), np.empty((16 * n_pixels, 3), np.float32)
+    known, sums = np.empty(corners * spp, np.int64), np.empty((corners * spp, terms, 3), np.float32)
+    for pixel in range(n_pixels):
+        count = 0
+        for i in range(pixel * spp, (pixel + 1) * spp):
+            if not lit[i]:
+                continue
+            for corner in range(corners):
+                vertex = np.int64(vertices[corner, i])
+                at = count - 1
+                while at >= 0 and known[at] != vertex:  # few, and the last ones are likely
+                    at -= 1
+                if at < 0:
+                    at, count = count, count + 1
+                    known[at], sums[at] = vertex, 0
+                for term in range(terms):
+                    for c in range(3):
+                        sums[at, term, c] += values[corner, term, c, i] * scale[i, c]
+        if size + count * terms > len(places):
+            more = len(places) + count * terms
+            places = np.concatenate((places, np.empty(more, np.int32)))
+            found = np.concatenate((found, np.empty((more, 3), np.float32)))
+        for at in range(count):
+            for term in range(terms):
+                row, value = rows[term, known[at]], sums[at, term]
+                if row >= 0 and (value[0] != 0 or value[1] != 0 or value[2] != 0):
+                    places[size], found[size] = row, value
+                    size += 1
+        starts[pixel + 1] = size
+    return starts, places[:size].copy(), found[:size].copy()
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

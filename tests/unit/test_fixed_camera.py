@@ -7,6 +7,7 @@ from conftest import COLOURS, T, build, diffuse, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.relighting.film import film_images
+from mi_sparse_prt.relighting.fixed_camera import _collected
 
 LIGHTING = prt.CubemapLighting(4)
 ENVIRONMENT = prt.Environment(np.random.default_rng(3).random((8, 16, 3), np.float32) ** 3)
@@ -177,3 +178,25 @@ def test_refusals(coloured, grey_scene):
         camera.image(np.ones((3, 3), np.float32))
     with pytest.raises(prt.PrtError, match="sensor"):
         prt.FixedCamera(scene, transport, 0)
+
+
+@pytest.mark.parametrize("terms", [0, 3])
+def test_shares_are_summed_for_each_pixel_and_row(terms):
+    """Expected: the sums of a loop over all of them, but for rounding; rows that vertices lack are left out."""
+    rng, n_v, n_pixels, spp = np.random.default_rng(terms), 40, 30, 16
+    vertices = rng.integers(0, n_v, (3, n_pixels * spp)).astype(np.uint32)
+    lit = rng.random(n_pixels * spp) < 0.7
+    values = rng.random((3, 1 + terms, 3, n_pixels * spp), np.float32)
+    scale = rng.random((n_pixels * spp, 3), np.float32)
+    rows = np.arange((1 + terms) * n_v).reshape(1 + terms, n_v)
+    rows[1:, ::2] = -1
+    known = np.zeros((n_pixels, rows.size, 3))
+    for corner, term, i in np.ndindex(3, 1 + terms, n_pixels * spp):
+        row = rows[term, vertices[corner, i]]
+        if lit[i] and row >= 0:
+            known[i // spp, row] += values[corner, term, :, i] * scale[i]
+    starts, places, found = _collected(vertices, lit, values, scale, rows, spp)
+    ours = np.zeros_like(known)
+    ours[np.repeat(np.arange(n_pixels), np.diff(starts)), places] = found
+    np.testing.assert_allclose(ours, known, rtol=1e-5)
+    assert len(places) == np.count_nonzero(known.any(axis=2))
