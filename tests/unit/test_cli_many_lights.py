@@ -110,6 +110,7 @@ def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_pa
     for name, value in {
         "SIZES": (20, 60),
         "SETTINGS": ((8, 16),),
+        "HALF": (4, 8),
         "LIGHTS": (10, 40),
         "CUTS": (0.3, 0.1),
         "PATH_SPP": (1, 64),
@@ -123,7 +124,7 @@ def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_pa
     result = call("benchmark", scene, "--many-lights", "--figures", figures, "--json", report)
     assert result.exit_code == 0 and "instant radiosity" in result.stdout
     found = json.loads(report.read_text())
-    assert len(found["curves"]) == 11 and len(found["table"]) == 2
+    assert len(found["curves"]) == 11 and len(found["table"]) == 3
     for points in found["curves"].values():
         assert points[-1]["error"] < 0.5 and points[-1]["seconds"] > 0
     assert found["singular_values"][0] == 1 and found["path"][0]["error"] > found["path"][-1]["error"]
