@@ -270,14 +270,22 @@ def test_a_page_is_exported(folder: Path, tmp_path: Path) -> None:
 
 def test_a_page_is_shown_until_ctrl_c(folder: Path) -> None:
     program = [sys.executable, "-m", "mi_sparse_prt", "view", folder / "m.prt", "--no-browser", "--quiet"]
-    with subprocess.Popen(map(str, program), stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        address = next(line.split()[0] for line in process.stderr if "127.0.0.1" in line)
-        with urllib.request.urlopen(address, timeout=20) as answer:
-            assert answer.status == 200 and b"<canvas" in answer.read()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
-        assert "interrupted" in process.stderr.read()
+    listening = partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # jobs in the background of a script do not
+    with subprocess.Popen(
+        map(str, program), stderr=subprocess.PIPE, text=True, preexec_fn=listening
+    ) as process:
+        try:
+            assert process.stderr is not None
+            address = next(line.split()[0] for line in process.stderr if "127.0.0.1" in line)
+            with urllib.request.urlopen(address, timeout=20) as answer:
+                assert answer.status == 200 and b"<canvas" in answer.read()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 130
+            assert "interrupted" in process.stderr.read()
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize(
