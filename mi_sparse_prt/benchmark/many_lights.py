@@ -33,10 +33,7 @@ RATIOS = {
 }  # columns for each row ([HPB07] Figure 6 has rows first)
 SIZES = 100, 400, 1200  # rows and columns together
 SETTINGS = (100, 100), (300, 900)  # of [HPB07] Table 2
-HALF = (
-    90,
-    370,
-)  # adaptive, of half as many elements as 300/900 (r n + c m, for 480,000 samples and 100,000 lights)
+HALF = 90, 370  # adaptive: less than half as many elements as 300/900 (r n + c m)
 EQUAL_TIME = 300, 900  # rows and columns that others have as long as ([HPB07] Figure 5)
 LIGHTS = 100, 500, 2500  # of the baselines
 CUTS = 0.1, 0.05, 0.02  # thresholds of lightcuts, in small images of diffuse scenes

@@ -53,9 +53,7 @@ class LampLitIntegrator(RelitIntegrator):
         for relit in self._more:
             value += relit.radiance(ray, sampler, active)[0]
         sampler.schedule_state()
-        dr.eval(
-            value, valid, ray
-        )  # on a GPU a kernel traces rays in one scene only, and what follows is another one
+        dr.eval(value, valid, ray)  # the next scene is another one, and a kernel on a GPU traces in one only
         if self._goes_on:
             direct, _ = follow(self._seen, ray, sampler, active, self._max_depth)
         else:

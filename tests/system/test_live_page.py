@@ -95,9 +95,8 @@ def served(driver, scene, transports, request):
     kind = request.param
     page = Served(scene, transports[kind], {} if kind == "lamps" else LIGHTS)
     open_page(driver, page.server.url)
-    driver.execute_script(
-        "v.held = false; v.touch()"
-    )  # a frame that was asked for while held came to nothing
+    # a frame that was asked for while the page was held came to nothing
+    driver.execute_script("v.held = false; v.touch()")
     yield SimpleNamespace(made=page.made, transport=transports[kind], kind=kind)
     wrong = [entry["message"] for entry in driver.get_log("browser") if entry["level"] == "SEVERE"]
     page.close()

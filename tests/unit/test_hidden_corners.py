@@ -37,6 +37,28 @@ def on_ground(scene: prt.Scene) -> tuple[mi.UInt32, mi.SurfaceInteraction3f, lis
     return hit.prim_index, si, [1 - u - v, u, v], corners
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_in_world_they_are_the_same(size):
+    """Rationale: pictures look for hidden corners in world space, whatever the scene's size is and wherever it stands.
+
+    Expected: weights as in the normalised frame, but for 0.1% of the points, which are as near to the wall as rounding.
+    """
+    place = T().translate([3 * size, -2 * size, 5 * size]).scale(size)
+    shapes = {"ground": GROUND, "wall": WALL}
+    moved = {name: {**shape, "to_world": place @ shape["to_world"]} for name, shape in shapes.items()}
+    scene, plain = build(0.2 * size, **moved), build(0.2, **shapes)
+    triangle, si, weights, _ = on_ground(plain)
+    world = hidden_corners(scene).in_world(scene)
+    assert world.some and scene.n_vertices == plain.n_vertices
+    known, found = (np.stack([w.numpy() for w in some]) for some in (
+        hidden_corners(plain).weights(triangle, si.p, -si.n, weights, mi.Mask(True)),
+        world.weights(triangle, scene.to_world(si.p), -si.n, weights, mi.Mask(True)),
+    ))  # fmt: skip
+    given = np.stack([w.numpy() for w in weights])
+    assert (np.abs(known - given).max(axis=0) > 1e-3).mean() > 0.02
+    assert (np.abs(found - known).max(axis=0) > 1e-3).mean() < 1e-3
+
+
 def test_corners_on_the_same_side():
     """
     Expected: of points on triangles that the wall passes through, weights of corners behind it are 0 and of the others
