@@ -44,7 +44,8 @@ def test_in_world_they_are_the_same(size):
     Expected: weights as in the normalised frame, but for 0.1% of the points, which are as near to the wall as rounding.
     """
     place = T().translate([3 * size, -2 * size, 5 * size]).scale(size)
-    shapes = {"ground": GROUND, "wall": WALL}
+    low = {**WALL, "to_world": T().translate([X, 0, 0]).rotate([0, 1, 0], 90).scale([2, 0.03, 1])}
+    shapes = {"ground": GROUND, "wall": low}  # a ray that is lifted too far passes over it
     moved = {name: {**shape, "to_world": place @ shape["to_world"]} for name, shape in shapes.items()}
     scene, plain = build(0.2 * size, **moved), build(0.2, **shapes)
     triangle, si, weights, _ = on_ground(plain)
