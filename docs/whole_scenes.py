@@ -22,8 +22,9 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.direct_speed import BareOcclusion
 from mi_sparse_prt.benchmark.measuring import timed
 from mi_sparse_prt.benchmark.zoo import judge
-from mi_sparse_prt.benchmark.zoo_rendering import RenderingProcess, ZooEffort, render_matrix, render_reference
+from mi_sparse_prt.benchmark.zoo_rendering import ZooEffort, render_matrix, render_reference
 from mi_sparse_prt.core.profiling import peak_memory
+from mi_sparse_prt.core.worker_process import WorkerProcess
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.validation.validate import validate
 
@@ -82,7 +83,7 @@ def measure(path: Path, resolution: int, target: float, rows: int) -> dict[str, 
 def measure_image(path: Path, resolution: int, target: float) -> dict[str, Any]:
     """A picture by ``sparse_prt`` against one by ``path``, as the zoo's."""
     effort = ZooEffort(resolution=resolution, target_error=target)
-    with RenderingProcess() as process:
+    with WorkerProcess() as process:
         _, truth = process.call(render_reference, path, effort, seconds=600)
         outcome, ours = process.call(render_matrix, path, effort, seconds=600)
     report = judge(path.stem, ours, truth) if outcome == "done" else {"verdict": outcome, "sentences": [ours]}

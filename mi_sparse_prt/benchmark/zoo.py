@@ -12,17 +12,15 @@ from tqdm.auto import tqdm
 from mi_sparse_prt.benchmark.measuring import describe_machine
 from mi_sparse_prt.benchmark.zoo_figures import SceneImages, draw_contact_sheet
 from mi_sparse_prt.benchmark.zoo_rendering import (
-    DONE,
-    ERROR,
     Pair,
     Rendering,
-    RenderingProcess,
     ZooEffort,
     render_matrix,
     render_reference,
 )
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.metrics import relative_l2_without_noise, relative_noise
+from mi_sparse_prt.core.worker_process import DONE, ERROR, WorkerProcess
 from mi_sparse_prt.validation.validate import save_figures
 
 ZOO = Path(__file__).parents[2] / "scenes_xml" / "zoo"
@@ -72,7 +70,7 @@ def measure_zoo(
     """
     files = scene_files(ZOO if place is None else place)
     found, images = [], {}
-    with RenderingProcess() as process:
+    with WorkerProcess() as process:
         for path in tqdm(files, desc="zoo", unit=" scenes", disable=not progress):
             report, pictures = _measure_scene(process, path, effort)
             found.append(report)
@@ -103,7 +101,7 @@ def scene_files(place: Path) -> list[Path]:
     return files
 
 
-def _measure_scene(process: RenderingProcess, path: Path, effort: ZooEffort) -> tuple[Report, SceneImages]:
+def _measure_scene(process: WorkerProcess, path: Path, effort: ZooEffort) -> tuple[Report, SceneImages]:
     """The report of a scene, and what there is of its pictures."""
     outcome, truth = process.call(render_reference, path, effort, seconds=REFERENCE_SECONDS)
     if outcome != DONE:

@@ -130,6 +130,19 @@ def load_environment(path: str | os.PathLike[str]) -> Environment:
     return Environment(_rgb_of(read_bitmap(path, "export it again"), path), source=str(path))
 
 
+def emitter_of(environment: Environment) -> mi.Emitter:
+    """An environment as a Mitsuba emitter, ``envmap``."""
+    to_world = np.eye(4)
+    to_world[:3, :3] = environment.rotation
+    return mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(environment.pixels)),
+            "to_world": mi.ScalarTransform4f(to_world),
+        }
+    )
+
+
 def environment_of(emitter: mi.Emitter, height: int = 256) -> Environment:
     """What an environment emitter of a scene shines, as an image of (height, 2 height) pixels: at their centres."""
     theta, phi = (np.pi * (np.arange(n) + 0.5) / height for n in (height, 2 * height))

@@ -20,7 +20,7 @@ from tqdm.auto import tqdm
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.emission.environment import Environment
+from mi_sparse_prt.emission.environment import Environment, emitter_of
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.hidden_corners import hidden_corners
 from mi_sparse_prt.reflection.factor_tables import look_up, outgoing_tables
@@ -463,14 +463,6 @@ def background_emitter(
     if isinstance(environment, mi.Emitter):
         return environment
     if isinstance(environment, Environment):
-        to_world = np.eye(4)
-        to_world[:3, :3] = environment.rotation
-        return mi.load_dict(
-            {
-                "type": "envmap",
-                "bitmap": mi.Bitmap(np.ascontiguousarray(environment.pixels)),
-                "to_world": mi.ScalarTransform4f(to_world),
-            }
-        )
+        return emitter_of(environment)
     texels, n = lighting.project(environment), lighting.resolution
     return mi.load_dict({"type": "cubemap", "data": mi.TensorXf(texels.reshape(6, n, n, 3)), "resolution": n})

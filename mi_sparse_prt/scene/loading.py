@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.variant import check_variant
-from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.scene import Scene, SceneFile
 
 
 def load_scene(path: str | Path, edge_length: float | None = None, **parameters: Any) -> Scene:
@@ -35,7 +35,7 @@ def load_scene(path: str | Path, edge_length: float | None = None, **parameters:
         scene = Scene._build(loaded, edge_length)
     except PrtError as error:
         raise PrtError(f"scene file {path}: {error}") from error
-    scene.path = str(path)
+    scene.file = SceneFile(str(path), edge_length, parameters)
     scene._warn()
     return scene
 

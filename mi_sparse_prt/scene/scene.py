@@ -12,7 +12,7 @@ import hashlib
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -52,6 +52,14 @@ class Mesh:
     vertices: slice
     triangles: NDArray[np.int32]
     shape: int = 0
+
+
+class SceneFile(NamedTuple):
+    """What a scene was loaded from: the arguments of ``load_scene``."""
+
+    path: str
+    edge_length: float | None
+    parameters: dict[str, Any]
 
 
 class Scene:
@@ -95,13 +103,13 @@ class Scene:
         These themselves.
     materials : list of Material
         One for each mesh.
-    path : str or None
-        The XML file.
+    file : SceneFile or None
+        What it was loaded from, if it was.
     """
 
     def __init__(self, mitsuba: mi.Scene, meshes: list[TriangleMesh], materials: list[Material]) -> None:
         """Use `Scene.from_mitsuba`; `meshes` are clean and in world space, `materials` one for each."""
-        self.path: str | None = None
+        self.file: SceneFile | None = None
         self.notes: list[PrtWarning] = []
         fronts = np.concatenate([m.positions for m in meshes])
         low, high = (f(fronts, axis=0).astype(np.float64) for f in (np.min, np.max))
@@ -229,6 +237,11 @@ class Scene:
                 f"the scene {self.path or ''} has {len(sensors)} sensors, there is no number {sensor}"
             )
         return sensors[sensor]
+
+    @property
+    def path(self) -> str | None:
+        """The XML file."""
+        return self.file.path if self.file else None
 
     @property
     def n_vertices(self) -> int:

@@ -161,6 +161,28 @@ def test_the_background_turns_with_the_light(page, exported):
         assert number == 0 or relative_l2(ours, wrong) > 0.3, how
 
 
+def test_rows_of_the_background_lie_where_mitsuba_has_them(driver, exported, tmp_path):
+    """Rationale: Mitsuba's first and last rows of pixels lie at the poles, those of a texture half a pixel from them.
+
+    Expected: a sky of rows, some beyond white, as ``render`` has it; by 0.06; with rows where a texture has them it is 0.2 away.
+    """
+    scene, transport, _, _ = exported
+    rows = np.random.default_rng(7).choice([0.1, 0.5, 0.9], 128)
+    rows[20:24] = 4.0
+    light = prt.Environment(np.tile(rows[:, None, None], (1, 256, 3)))
+    make_page(scene, transport, {"rows": light}, kept=0.3).save(tmp_path / "rows.html")
+    open_page(driver, (tmp_path / "rows.html").as_uri())
+    driver.execute_script("v.camera.eye = [0, 8, 0]; v.camera.target = [0.4, 8.9, -0.5]")
+    ours = linear(picture(driver))
+    view = driver.execute_script(
+        "const {eye, target, up, height} = v.camera; return {eye, target, up, height}"
+    )
+    sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
+    theirs = np.clip(prt.render(scene, transport, light, sensor, 64), 0, 1)
+    assert np.ptp(theirs) > 0.5
+    assert relative_l2(ours, theirs) < 0.1
+
+
 def test_colours_of_vertices_are_those_of_python(page, exported):
     """The graphics card's part: clusters to vertices. Expected: those of what the page keeps, to 0.1%."""
     scene, _, made, _ = exported

@@ -17,7 +17,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark.gallery import images_beside
 from mi_sparse_prt.core.metrics import flip_map
 from mi_sparse_prt.relighting.viewer import make_live_page
-from mi_sparse_prt.relighting.viewer.answers import page_sensor
+from mi_sparse_prt.relighting.viewer.question import page_sensor
 from mi_sparse_prt.relighting.viewer.server import PageServer
 from mi_sparse_prt.relighting.viewer.turning import turn_matrix
 
@@ -208,6 +208,26 @@ def test_a_picture_by_python_lies_over_the_page(driver, served, by):
     assert shown.shape == theirs.shape
     assert far(shown, theirs) < (0.06 if by == "render" else 0.2)  # 12 samples and more per pixel
     assert shown.mean() == pytest.approx(np.clip(theirs, 0, 1).mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("served", ["clusters"], indirect=True)
+def test_nothing_waits_for_a_picture_by_path(driver, served):
+    """Expected: a row comes although a picture by ``path`` never does; for one by ``render`` it would wait."""
+    settled(driver)
+    driver.execute_script(
+        "const way = v.python.way, never = () => new Promise((end) => (window.end = end));"
+        "v.python.way = (question, c) => (question.ask === 'picture' ? never() : way(question, c));"
+    )
+    row = "v.python.ask({ask: 'row', eye: v.camera.eye, towards: [0, -1, 0]}).then(() => window.told = true);"
+    for by, told in (("path", True), ("render", False)):
+        driver.execute_script(
+            "window.told = false; v.python.ask({ask: 'picture', by: arguments[0]});" + row, by
+        )
+        driver.execute_async_script(UNTIL, "window.told", 1000)
+        assert driver.execute_script("return window.told") is told, by
+    driver.execute_script("window.end([{}, new ArrayBuffer(0)])")
+    driver.execute_async_script(UNTIL, "window.told", 5000)
+    assert driver.execute_script("return window.told")
 
 
 @pytest.mark.parametrize("served", ["clusters"], indirect=True)

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import mi_sparse_prt as prt
 from mi_sparse_prt.relighting.image import background_emitter
 from mi_sparse_prt.relighting.viewer import make_live_page
-from mi_sparse_prt.relighting.viewer.answers import page_sensor
 from mi_sparse_prt.relighting.viewer.page_scene import draw_order
+from mi_sparse_prt.relighting.viewer.question import page_sensor
 from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 

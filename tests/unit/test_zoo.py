@@ -1,9 +1,7 @@
 """The zoo: that it is complete, what its verdicts mean, and that a scene which fails takes nothing else with it."""
 
-import os
 import re
 import sys
-import time
 from pathlib import Path
 
 import mitsuba as mi
@@ -22,7 +20,6 @@ from mi_sparse_prt.benchmark.zoo import (
     verdict,
 )
 from mi_sparse_prt.benchmark.zoo_figures import GAP, LABEL, SceneImages, draw_contact_sheet
-from mi_sparse_prt.benchmark.zoo_rendering import RenderingProcess
 from mi_sparse_prt.cli.tables.zoo import zoo_tables
 from mi_sparse_prt.core.errors import PrtError
 
@@ -108,20 +105,6 @@ def test_pictures_with_nan_do_not_agree():
     for ours, truth, whose in ((right, wrong, "path"), (wrong, right, "sparse_prt")):
         found = judge("it", Rendering(ours, 1.0, 0.01, []), truth)
         assert found["verdict"] == "error" and found["sentences"] == [f"{whose}: pixels are NaN or infinite"]
-
-
-def test_a_process_outlives_what_fails_in_it():
-    """Expected: results, refusals, exceptions, the end of the process and of its time; and results again after each."""
-    with RenderingProcess() as process:
-        assert process.call(max, 1, 2, seconds=60) == ("done", 2)
-        outcome, sentence = process.call(scene_files, Path("nowhere"), seconds=60)
-        assert outcome == "refused" and "nowhere" in sentence
-        assert process.call(int, "x", seconds=60)[1].startswith("ValueError")
-        assert process.call(os._exit, 3, seconds=60) == ("error", "the process ended with exit code 3")
-        start = time.perf_counter()
-        assert process.call(time.sleep, 600, seconds=1)[0] == "too long"
-        assert time.perf_counter() - start < 60
-        assert process.call(max, 1, 2, seconds=60) == ("done", 2)
 
 
 def test_a_folder_without_scenes_is_refused(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -17,27 +16,28 @@ from scipy.spatial import cKDTree
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.environment import SUFFIXES, Environment, load_environment
-from mi_sparse_prt.relighting.image import background_emitter, render
+from mi_sparse_prt.relighting.image import render
 from mi_sparse_prt.relighting.viewer import page_scene
+from mi_sparse_prt.relighting.viewer.path_pictures import PathPictures
+from mi_sparse_prt.relighting.viewer.question import Question, number, page_sensor, vector, whole
 from mi_sparse_prt.relighting.viewer.turning import turn_matrix
 from mi_sparse_prt.relighting.viewer.visible_lamps import VisibleLamps
-from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 
 SPP = 4  # samples per pixel of a pass; passes go on while nothing moves
-MOST_PIXELS = 1 << 22
 MOST_BYTES = 1 << 28  # of a dropped image
 NEAREST = 16  # vertices to choose from where a surface is clicked
 LARGEST_HALF = 65504.0
 
 Floats = NDArray[np.float32]
-Question = Mapping[str, Any]
 Answer = tuple[dict[str, Any], bytes]
 
 
 class Answers:
     """Answers to the questions of a page, one at a time: it keeps nothing of who asks.
+
+    Pictures by ``path`` are made in a process of their own beside all others, see ``PathPictures``.
 
     Parameters
     ----------
@@ -64,12 +64,13 @@ class Answers:
         self.environments = dict(environments)
         self._closed = False
         self._one = threading.Lock()  # two browsers do not render at the same time
-        self._lit: tuple[object, mi.Scene] | None = None
+        self._path = PathPictures(scene, transport, self._one)
         self._places = cKDTree(scene.positions)
 
     def close(self) -> None:
         """Answer no more; returns when the last answer was found."""
         self._closed = True
+        self._path.close()
         self._one.acquire()
 
     def reply(self, question: Question, content: bytes = b"") -> Answer:
@@ -97,13 +98,15 @@ class Answers:
         ways = {
             "colours": self._colours,
             "row": self._row,
-            "picture": self._picture,
+            "picture": self._render,
             "environment": self._environment,
         }
         if question.get("ask") not in ways:
             raise PrtError(f"a page asks for {', '.join(ways)}, not for {question.get('ask')!r}")
         if self._closed:
             raise PrtError("the page was closed")
+        if question["ask"] == "picture" and question.get("by") == "path":
+            return self._render_by_path(question, content)
         with self._one:
             return ways[question["ask"]](question, content)
 
@@ -118,7 +121,7 @@ class Answers:
         found = self.transport.incident.relight(light.reshape(-1, 3))
         parts = [found[: self.scene.n_vertices]]
         if self.transport.terms:
-            eye = _vector(question, "eye")
+            eye = vector(question, "eye")
             away = eye - self.scene.positions
             away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-30)
             by_page = self.scene.albedo * parts[0]
@@ -127,12 +130,11 @@ class Answers:
             parts.append(np.where(faces[:, None], gloss, 0))
         elif self._lamps is not None:
             parts.append(self._lamps.shine(light.reshape(-1, 3), self.scene.n_vertices))
-        halves = [np.clip(part[self._order], -LARGEST_HALF, LARGEST_HALF).astype("<f2") for part in parts]
-        return {}, b"".join(part.tobytes() for part in halves)
+        return {}, b"".join(_in_halves(part[self._order]) for part in parts)
 
     def _row(self, question: Question, content: bytes) -> Answer:
         """The row of T (m, 3) of the vertex where a ray from the eye meets a surface; nothing where it meets none."""
-        origin, towards = _vector(question, "eye"), _vector(question, "towards")
+        origin, towards = vector(question, "eye"), vector(question, "towards")
         if not towards.any():
             raise PrtError("towards=[0, 0, 0] is no direction")
         ray = mi.Ray3f(origin.tolist(), (towards / np.linalg.norm(towards)).tolist())
@@ -151,40 +153,28 @@ class Answers:
         facing = self.scene.normals[near] @ towards > 0
         return int(near[np.argmax(facing)])
 
-    def _picture(self, question: Question, content: bytes) -> Answer:
-        """One pass of a picture (height, width, 3), linear RGB in half floats, by ``render`` or by ``path``."""
-        sensor = page_sensor(question)
-        seed = _whole(question, "pass", 0, 1 << 20)
-        light = self._light(question, content)
-        if question.get("by") == "render":
-            image = render(self.scene, self.transport, light, sensor, SPP, seed)
-        elif question.get("by") == "path":
-            image = self._by_path(light, sensor, seed)
-        else:
+    def _render(self, question: Question, content: bytes) -> Answer:
+        """One pass of a picture (height, width, 3) by ``render``, linear RGB in half floats."""
+        if question.get("by") != "render":
             raise PrtError(f"pictures are by render or path, not by {question.get('by')!r}")
-        return {"spp": SPP}, np.clip(image, 0, LARGEST_HALF).astype("<f2").tobytes()
+        sensor, seed = page_sensor(question), _pass(question)
+        image = render(self.scene, self.transport, self._light(question, content), sensor, SPP, seed)
+        return {"spp": SPP}, _in_halves(image)
 
-    def _by_path(self, light: Environment | Floats, sensor: mi.Sensor, seed: int) -> Floats:
-        """Mitsuba's own, to the depth of the matrix."""
-        path = mi.load_dict({"type": "path", "max_depth": self.transport.max_depth})
-        arguments: dict[str, Any] = {"sensor": sensor, "integrator": path, "spp": SPP, "seed": seed}
-        if not isinstance(light, Environment):
-            with self.transport.emission.scene_lit_by(light, self.scene) as lit:
-                return np.array(mi.render(lit, **arguments))[..., :3]
-        key = id(light.pixels), light.rotation.tobytes()
-        if self._lit is None or self._lit[0] != key:
-            emitter = background_emitter(light, self.transport.lighting)
-            self._lit = key, lit_scene(self.scene.unlit_shapes(), emitter)
-        return np.array(mi.render(self._lit[1], **arguments))[..., :3]
+    def _render_by_path(self, question: Question, content: bytes) -> Answer:
+        """The same by Mitsuba's own ``path``, to the depth of the matrix."""
+        page_sensor(question)  # what is wrong with it is said here
+        seed = _pass(question)
+        image = self._path.render(self._light(question, content), question, SPP, seed)
+        return {"spp": SPP}, _in_halves(image)
 
     def _light(self, question: Question, content: bytes) -> Environment | Floats:
         """An environment that is turned, or how bright lamps are (m, 3)."""
         if not isinstance(self.transport.emission, CubemapLighting):
-            return np.frombuffer(content, "<f4").reshape(-1, 3)
-        number = _whole(question, "environment", 0, len(self.environments))
-        chosen = list(self.environments.values())[number]
-        tip = _vector({"tip": [0, 0, 0]} | dict(question), "tip").tolist()
-        return chosen.rotated(turn_matrix(_number(question, "degrees"), question.get("axis", "y"), tip))
+            return self.transport.emission.project(np.frombuffer(content, "<f4").reshape(-1, 3))
+        chosen = list(self.environments.values())[whole(question, "environment", 0, len(self.environments))]
+        tip = vector({"tip": [0, 0, 0]} | dict(question), "tip").tolist()
+        return chosen.rotated(turn_matrix(number(question, "degrees"), question.get("axis", "y"), tip))
 
     def _environment(self, question: Question, content: bytes) -> Answer:
         """A dropped image as one more light of the page: its radiance (RGB9_E5), and its background."""
@@ -209,47 +199,11 @@ class Answers:
         return header, arrays["environment0"].astype("<u4").tobytes()
 
 
-def _number(question: Question, name: str) -> float:
-    value = question.get(name)
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        raise PrtError(f"{name}={value!r}: a number is asked for")
-    return float(value)
+def _pass(question: Question) -> int:
+    """Which pass of a picture is asked for: its seed."""
+    return whole(question, "pass", 0, 1 << 20)
 
 
-def _whole(question: Question, name: str, least: int, stop: int) -> int:
-    value = question.get(name)
-    if not isinstance(value, int) or not least <= value < stop:
-        raise PrtError(f"{name}={value!r}: a whole number from {least} to {stop - 1} is asked for")
-    return value
-
-
-def _vector(question: Question, name: str) -> NDArray[np.float32]:
-    value = question.get(name)
-    if not isinstance(value, list) or len(value) != 3:
-        raise PrtError(f"{name}={value!r}: three numbers are asked for")
-    return np.array([_number({name: x}, name) for x in value], np.float32)
-
-
-def page_sensor(question: Question) -> mi.Sensor:
-    """The page's camera: eye, target, up (world), height at distance 1, and columns and rows of pixels."""
-    across, down = (_whole(question, name, 1, 1 << 14) for name in ("columns", "rows"))
-    if across * down > MOST_PIXELS:
-        raise PrtError(f"{across} x {down} pixels: make the window smaller")
-    eye, target, up = (_vector(question, name).tolist() for name in ("eye", "target", "up"))
-    height = _number(question, "height")
-    if eye == target or height <= 0:
-        raise PrtError("a camera looks at another place than its own, and its picture has a height")
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov_axis": "y",
-            "fov": math.degrees(2 * math.atan(height / 2)),
-            "to_world": mi.ScalarTransform4f().look_at(eye, target, up),
-            "film": {
-                "type": "hdrfilm",
-                "width": across,
-                "height": down,
-                "rfilter": {"type": "box"},
-            },
-        }
-    )
+def _in_halves(image: Floats) -> bytes:
+    """Half floats, as pages read them."""
+    return np.clip(image, -LARGEST_HALF, LARGEST_HALF).astype("<f2").tobytes()

@@ -20,7 +20,7 @@ from mi_sparse_prt.scene.scene import Mesh, Scene
 
 HEIGHT = 128  # of environments in a page, which are twice as wide: two pixels in a texel of n = 32
 SHARPEST = 512  # rows of a background, at most
-QUALITY = 98  # of its JPEG
+QUALITY = 99  # of its JPEG
 TEXTURE = 512  # pixels along an edge of an albedo texture
 PERSPECTIVE = "PerspectiveCamera", "ThinLensCamera"  # sensors that a page can stand for
 

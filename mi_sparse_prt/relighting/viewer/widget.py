@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.emission.environment import Environment, environment_of
 from mi_sparse_prt.relighting.image import render
-from mi_sparse_prt.relighting.viewer.answers import page_sensor
 from mi_sparse_prt.relighting.viewer.live import LivePage, make_live_page
+from mi_sparse_prt.relighting.viewer.question import page_sensor
 from mi_sparse_prt.relighting.viewer.turning import AXES, axis_up, turn_matrix
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -137,6 +138,12 @@ class Viewer(anywidget.AnyWidget):
             loop, found = self._screenshots[content["screenshot"]]
             loop.call_soon_threadsafe(lambda: found.done() or found.set_result(sent))
             return
+        if content["header"].get("by") == "path":  # by a process of its own: the kernel does not wait for it
+            threading.Thread(target=self._reply, args=(content, sent), daemon=True).start()
+        else:
+            self._reply(content, sent)
+
+    def _reply(self, content: Mapping[str, Any], sent: bytes) -> None:
         header, answer = self._live.answers.reply(content["header"], sent)
         self.send({"number": content["number"], "header": header}, [answer])
 

@@ -99,12 +99,16 @@ uniform mat3 turn; // from there to that of the environment
 uniform float brightness;
 in vec2 place;
 out vec4 colour;
+vec2 fromPole(vec2 uv, sampler2D image) { // Mitsuba's first and last rows of pixels lie at the poles
+  float rows = float(textureSize(image, 0).y);
+  return vec2(uv.x, (uv.y * (rows - 1.0) + 0.5) / rows);
+}
 vec3 background() {
   vec3 d = turn * normalize(towards * vec3(place, 1.0));
   vec2 uv = vec2(atan(d.x, -d.z) / 6.283185307, acos(clamp(d.y, -1.0, 1.0)) / 3.141592654);
-  vec3 radiance = sharper == 1 ? textureLod(sharp, uv, 0.0).rgb : vec3(1.0);
+  vec3 radiance = sharper == 1 ? textureLod(sharp, fromPole(uv, sharp), 0.0).rgb : vec3(1.0);
   if (max(radiance.r, max(radiance.g, radiance.b)) > 0.98) { // too bright for an image of 8 bits, or there is none
-    vec3 blurred = textureLod(environment, uv, 0.0).rgb;
+    vec3 blurred = textureLod(environment, fromPole(uv, environment), 0.0).rgb;
     radiance = sharper == 1 ? max(radiance, blurred) : blurred;
   }
   return radiance * brightness;

@@ -15,14 +15,15 @@ async function askServer(header, content = new Uint8Array()) {
   return [JSON.parse(new TextDecoder().decode(bytes.slice(4, 4 + length))), bytes.slice(4 + length)];
 }
 
-// One question at a time; what Python or the way to it says is wrong is shown, and is gone with the next answer
+// One question at a time, beside pictures by a process of their own; what Python or the way to it says is wrong is shown, and is gone with the next answer
 class Python {
   constructor(ask) {
     Object.assign(this, { way: ask, last: Promise.resolve(), failed: false, asked: 0 });
   }
 
   ask(header, content) {
-    const answer = this.last.then(async () => {
+    const apart = header.by === "path", before = apart ? Promise.resolve() : this.last;
+    const answer = before.then(async () => {
       this.asked++;
       try {
         const [found, bytes] = await this.way(header, content);
@@ -36,7 +37,7 @@ class Python {
         return null;
       }
     });
-    this.last = answer;
+    if (!apart) this.last = answer;
     return answer;
   }
 }
