@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 7
+TOGETHER = 96  # lights of a block: factors are converted once for all, and larger results are fresh memory each time
 
 Floats = NDArray[np.float32]
 
@@ -242,7 +243,7 @@ class LightTransport:
         self,
         lights: ArrayLike | Iterable[Any],
         into: Callable[[int, Floats], object] | Any = None,
-        together: int = 384,
+        together: int = TOGETHER,
     ) -> Floats | None:
         """Radiosity / pi under many lights, some at a time: a year of skies, or one light after the other.
 

@@ -164,7 +164,7 @@ def test_the_background_turns_with_the_light(page, exported):
 def test_rows_of_the_background_lie_where_mitsuba_has_them(driver, exported, tmp_path):
     """Rationale: Mitsuba's first and last rows of pixels lie at the poles, those of a texture half a pixel from them.
 
-    Expected: a sky of rows, some beyond white, as ``render`` has it; by 0.06; with rows where a texture has them it is 0.2 away.
+    Expected: a sky of rows, some beyond white, as ``render`` has it but for 0.06; where a texture has rows it is 0.2.
     """
     scene, transport, _, _ = exported
     rows = np.random.default_rng(7).choice([0.1, 0.5, 0.9], 128)
