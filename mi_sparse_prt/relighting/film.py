@@ -18,7 +18,7 @@ from mi_sparse_prt.relighting.light import even_lights
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
 
-TOGETHER = 64  # lights, one at a time, whose products are found at once
+TOGETHER = 192  # lights, one at a time, whose products are found at once
 
 Floats = NDArray[np.float32]
 
