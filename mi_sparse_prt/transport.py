@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 FORMAT = "mi_sparse_prt light transport matrix"
 VERSION = 7
-TOGETHER = 96  # lights of a block: factors are converted once for all; larger results are fresh memory each time
+TOGETHER = 96  # lights of a block: results of many more are fresh memory each time, which takes longer
 
 Floats = NDArray[np.float32]
 
