@@ -3,8 +3,8 @@
     python docs/page_likeness.py scenes_xml/bunny.xml bunny.prt --figures DIRECTORY
 
 Prints JSON: for each environment of the page the mean FLIP of three views, each under a light turned otherwise, at
-640 x 480 and 64 samples per pixel. Surfaces that the page draws plain are not left out. Pictures are written beside
-each other: the page's, ``render``'s, and their difference.
+640 x 480 and 64 samples per pixel. Surfaces that the page draws plain are not left out. Pictures of both are
+written beside each other.
 """
 
 from __future__ import annotations
@@ -69,10 +69,8 @@ def compare(scene: prt.Scene, transport: prt.LightTransport, folder: Path | None
                 assert view["light"] == name
                 sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
                 light = lights[name].rotated(turn_matrix(view["degrees"], view["axis"], view["tip"]))
-                ours, theirs = (
-                    drawn(view["picture"]),
-                    prt.render(scene, transport, light, sensor, SPP),
-                )
+                ours = drawn(view["picture"])
+                theirs = prt.render(scene, transport, light, sensor, SPP)
                 found[name].append(float(flip_map(np.clip(theirs, 0, 1), ours).mean()))
                 if folder is not None:
                     beside = images_beside({"page": ours, "render": theirs}, theirs)

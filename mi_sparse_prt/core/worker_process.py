@@ -68,10 +68,7 @@ class WorkerProcess:
     def _started(self) -> tuple[subprocess.Popen[bytes], Connection]:
         if self._process is None or self._connection is None:
             ours, theirs = socket.socketpair()
-            with (
-                ours,
-                theirs,
-            ):  # their end is closed here, so that the end of the process is that of the connection
+            with ours, theirs:  # closed here, so that the end of the process is that of the connection
                 self._process = subprocess.Popen(
                     [sys.executable, "-P", "-c", START, str(theirs.fileno())],
                     stdin=subprocess.PIPE,  # never written to: it ends with this process

@@ -39,8 +39,8 @@ class PathPictures:
     scene : Scene
     transport : LightTransport
         Of a cubemap or of lamps.
-    one : context manager
-        Within which this process renders.
+    lock : context manager
+        That this process holds when it renders.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class PathPictures:
         Why pictures are made here, where they are.
     """
 
-    def __init__(self, scene: Scene, transport: LightTransport, one: AbstractContextManager[object]) -> None:
+    def __init__(self, scene: Scene, transport: LightTransport, lock: AbstractContextManager[object]) -> None:
         groups = transport.emission.attributes()["groups"] if transport.lights else None
-        self._here, self._rendering = _Renderer(scene, groups, transport.max_depth), one
+        self._here, self._rendering = _Renderer(scene, groups, transport.max_depth), lock
         self._process, self._asking = WorkerProcess(), threading.Lock()
         self._closed = False
         self.reason: str | None = "the scene is not from a file" if scene.file is None else None
@@ -102,6 +102,8 @@ class PathPictures:
             if outcome == DONE and found is None:  # pixels are sent once, not for each pass
                 self._process.call(_keep, id(pixels), pixels)
                 outcome, found = self._process.call(*asked)
+        if self._closed:
+            self._process.kill()  # it may have begun after it was closed
         if outcome == DONE:
             return found
         self.reason = str(found)
@@ -176,8 +178,7 @@ def _rendered(
 
 def _renderer(there: _There) -> _Renderer:
     """Load the scene, behind everything else that runs."""
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(NICE)
+    os.nice(NICE)
     if mi.variant() != there.variant:
         raise PrtError(f"Mitsuba runs in the variant {mi.variant()} here, not in {there.variant}")
     path, edge_length, parameters = there.file

@@ -15,7 +15,8 @@ async function askServer(header, content = new Uint8Array()) {
   return [JSON.parse(new TextDecoder().decode(bytes.slice(4, 4 + length))), bytes.slice(4 + length)];
 }
 
-// One question at a time, beside pictures by a process of their own; what Python or the way to it says is wrong is shown, and is gone with the next answer
+// One question at a time, and pictures by path beside them: a process of their own makes these.
+// What Python or the way to it says is wrong is shown, and is gone with the next answer
 class Python {
   constructor(ask) {
     Object.assign(this, { way: ask, last: Promise.resolve(), failed: false, asked: 0 });
