@@ -70,8 +70,9 @@ def compare(scene: prt.Scene, transport: prt.LightTransport, folder: Path | None
                 sensor = page_sensor(view | {"columns": SIZE[0], "rows": SIZE[1]})
                 light = lights[name].rotated(turn_matrix(view["degrees"], view["axis"], view["tip"]))
                 ours = drawn(view["picture"])
-                theirs = prt.render(scene, transport, light, sensor, SPP)
-                found[name].append(float(flip_map(np.clip(theirs, 0, 1), ours).mean()))
+                # a screen shows no more than 1
+                theirs = np.clip(prt.render(scene, transport, light, sensor, SPP), 0, 1)
+                found[name].append(float(flip_map(theirs, ours).mean()))
                 if folder is not None:
                     beside = images_beside({"page": ours, "render": theirs}, theirs)
                     beside.savefig(folder / f"{name}_{len(found[name])}.png")
