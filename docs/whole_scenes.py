@@ -35,7 +35,7 @@ BLOCK = 1 << 23  # rays of the bare loop at a time
 def bare_seconds(scene: prt.Scene, lighting: prt.CubemapLighting) -> float:
     """Of one occlusion ray per element above the horizon; the second pass, kernels compiled."""
     points = vertex_points(scene)
-    bare = BareOcclusion(scene.normalised, lighting, points)
+    bare = BareOcclusion(scene.unsplit, lighting, points)
     step = max(1, BLOCK // lighting.n_directions)
 
     def trace() -> None:

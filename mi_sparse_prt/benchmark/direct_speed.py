@@ -81,7 +81,7 @@ def measure_direct(
     """
     points = vertex_points(scene)
     solver = DirectSolver(diffuse_problem(scene, lighting))
-    bare = BareOcclusion(scene.normalised, lighting, points)
+    bare = BareOcclusion(scene.unsplit, lighting, points)
     blocks = [(a, min(a + solver.block_size, len(points))) for a in range(0, len(points), solver.block_size)]
     bits = solver.row_storage(len(points)).astype(np.uint32, copy=False)  # a fact, told to mypy
 

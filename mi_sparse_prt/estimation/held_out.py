@@ -43,6 +43,7 @@ ROUNDING = 1e-5  # relative errors below are those of float32
 HELD_OUT = 1  # spawn key
 BATCH = 1 << 20  # elements, evaluated together
 ROUND = 0.25  # of the elements: these mostly tell whether a target is met
+KNOWN = 0.1  # of a target: an error that is known so well, and still about the target, is left at that
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def held_out_error(
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     target : float, optional
         Relative L2 error. If given, elements are drawn by the quarter until it is clear (2 standard errors) whether the
-        error is above it.
+        error is above it, or the standard error is a tenth of it.
     effort : Effort
     indirect : bool
         Whether a matrix without indirect light is judged by what it lacks. It is not if ``max_depth`` is 2; to ask for
@@ -147,7 +148,8 @@ def held_out_error(
     while rounds < round(1 / ROUND):
         samples, rounds = _together(samples, estimator.samples(rng, ROUND)), rounds + 1
         found = estimate_errors(samples)
-        if abs(found.total - target) > 2 * found.standard_error["total"]:
+        error = found.standard_error["total"]
+        if abs(found.total - target) > 2 * error or error < KNOWN * target:
             break
     return replace(found, dark=_squared_norm(samples) < rounds * DARK**2 * open_square)
 

@@ -1,9 +1,9 @@
 """From a Mitsuba scene to vertices: positions, normals, albedo, triangles, and a copy in the unit box.
 
 The rooms behind this one never look at Mitsuba shapes. What they get is a `Scene`: clean triangle meshes
-whose vertices are the rows of the light transport matrix, and two Mitsuba scenes with exactly these meshes: one
+whose vertices are the rows of the light transport matrix, and Mitsuba scenes with exactly these meshes: one
 where the user put them, one scaled to the unit box, where Mitsuba's absolute ray offsets mean the same for
-every scene.
+every scene; and one of the same surfaces in few triangles, which rays are faster in.
 """
 
 from __future__ import annotations
@@ -91,6 +91,9 @@ class Scene:
     normalised : mi.Scene
         The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
         no sensors.
+    unsplit : mi.Scene
+        The same surfaces, flat ones as they were before their edges were bisected: for rays that need no vertices. A
+        floor is two triangles then; in a room, rays are up to eight times faster.
     centre : (3,) float64
     scale : float
         normalised = (world - centre) * scale, computed in float64. A scene that was scaled gives the same
@@ -126,6 +129,7 @@ class Scene:
         names = [mesh.name for mesh in meshes]
         self.mitsuba: mi.Scene = build_mitsuba_scene(world, names, mitsuba)
         self.normalised: mi.Scene = build_mitsuba_scene(unit, names)
+        self.unsplit: mi.Scene = self._unsplit_scene(unit, meshes, materials)
         self._surfaces = meshes
 
         albedo = [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
@@ -150,6 +154,20 @@ class Scene:
         self.positions = fronts[self.front_of]
         self.normals = np.concatenate([m.normals for m in (*meshes, *(back.mesh for back in backs))])
         self.normalised_positions = self._normalise(self.positions)
+
+    def _unsplit_scene(
+        self, unit: list[mi.Mesh], meshes: list[TriangleMesh], materials: list[Material]
+    ) -> mi.Scene:
+        """The normalised scene of meshes as they were before flat triangles were split; it itself if none was."""
+        if all(mesh.unsplit is None for mesh in meshes):
+            return self.normalised
+        shapes = [
+            shape
+            if mesh.unsplit is None
+            else build_mitsuba_mesh(mesh.unsplit, k.bsdf, positions=self._normalise(mesh.unsplit.positions))
+            for shape, mesh, k in zip(unit, meshes, materials, strict=True)
+        ]
+        return build_mitsuba_scene(shapes, [mesh.name for mesh in meshes])
 
     def _normalise(self, positions: NDArray[np.float32]) -> NDArray[np.float32]:
         return ((positions.astype(np.float64) - self.centre) * self.scale).astype(np.float32)
@@ -210,16 +228,16 @@ class Scene:
         return p / self.scale + mi.Point3f(*map(float, self.centre))
 
     def shape_in_world(self, shape: mi.ShapePtr, active: mi.Mask) -> mi.ShapePtr:
-        """The shapes of ``mitsuba``, which have emitters, in place of those of ``normalised``.
+        """The shapes of ``mitsuba``, which have emitters, in place of those of ``normalised`` or ``unsplit``.
 
-        A kernel on a GPU can trace rays in one scene only: what rays of ``normalised`` meet is looked up.
+        A kernel on a GPU can trace rays in one scene only: what rays of others meet is looked up.
         """
         return dr.reinterpret_array(mi.ShapePtr, self._shapes_in_world.gather(shape, active))
 
     @cached_property
     def _shapes_in_world(self) -> ShapeTable:
         pointers = dr.reinterpret_array(mi.UInt32, self.mitsuba.shapes_dr())
-        return ShapeTable(self.normalised, pointers.numpy())
+        return ShapeTable([self.normalised, self.unsplit], np.tile(pointers.numpy(), 2))
 
     def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
         """One of the scene's own cameras by its number; a sensor is passed on.
@@ -296,6 +314,19 @@ class Scene:
     def rough_glass(self) -> list[mi.BSDF]:
         """BSDFs that let light through into a range of directions."""
         return [material.bsdf for material in self.materials[: len(self.fronts)] if material.rough_glass]
+
+    @cached_property
+    def specular_surfaces(self) -> mi.Scene:
+        """Those of ``unsplit`` from which light goes on as it came, alone: rays that may meet one are found fast."""
+        which = [
+            k
+            for k, m in enumerate(self.materials[: len(self.fronts)])
+            if m.single_directions or m.rough_glass
+        ]
+        shapes = self.unsplit.shapes()
+        if len(which) == len(shapes):
+            return self.unsplit
+        return build_mitsuba_scene([shapes[k] for k in which], [self.fronts[k].name for k in which])
 
     @property
     def passes_straight(self) -> bool:

@@ -9,21 +9,23 @@ from numpy.typing import ArrayLike
 
 
 class ShapeTable:
-    """One number for each shape of a scene, found on the device from pointers to shapes.
+    """One number for each shape of scenes, found on the device from pointers to shapes.
 
     Parameters
     ----------
-    scene : mi.Scene
+    scenes : list of mi.Scene
     values : (shapes,) uint32
-        In the order of ``scene.shapes()``.
+        In the order of ``scene.shapes()``, scene after scene.
 
     Notes
     -----
     A pointer to a shape is a number on the device, by which Dr.Jit knows objects; shapes do not follow each other.
     """
 
-    def __init__(self, scene: mi.Scene, values: ArrayLike) -> None:
-        pointers = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+    def __init__(self, scenes: list[mi.Scene], values: ArrayLike) -> None:
+        pointers = np.concatenate(
+            [dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy() for scene in scenes]
+        )
         table = np.zeros(int(pointers.max()) + 1, np.uint32)
         table[pointers] = values
         self._table = mi.UInt32(table)
@@ -42,4 +44,4 @@ def first_triangles(scene: mi.Scene) -> ShapeTable:
         Of meshes.
     """
     counts = [shape.face_count() for shape in scene.shapes()]
-    return ShapeTable(scene, np.cumsum([0, *counts[:-1]]))
+    return ShapeTable([scene], np.cumsum([0, *counts[:-1]]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, is_flat, normalise_rows, triangle_normals
 
 #: Edges longer by this share than asked for are still accepted, so that ties (a square's diagonal is a power
 #: of two of its default edge) do not depend on how float32 rounds a scene that was scaled or moved.
@@ -29,7 +29,8 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
     An edge's length decides alone, so both of its sides split at the same midpoint and no T-junction appears,
     also between vertices that share a position but not a normal. Triangles with one, two or three long edges
     become two, three or four. Positions, texture coordinates and attributes are interpolated linearly; normals
-    too, then normalised. The old vertices come first, in their order.
+    too, then normalised. The old vertices come first, in their order. What it was is kept (``unsplit``) where all
+    triangles are flat.
 
     Parameters
     ----------
@@ -48,6 +49,7 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
     area = float(np.linalg.norm(triangle_normals(mesh), axis=1).sum()) / 2
     if area / (np.sqrt(3) / 4 * (edge_length * (1 + TIE)) ** 2) / 2 > 1.1 * limit:
         raise too_many_vertices(mesh.name, edge_length, limit)
+    unsplit = mesh
     while True:
         t = mesh.triangles
         edges = np.sort(
@@ -59,7 +61,7 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
         p = mesh.positions.astype(np.float64)
         long = np.linalg.norm(p[ends[:, 0]] - p[ends[:, 1]], axis=1) > edge_length * (1 + TIE)
         if not long.any():
-            return mesh
+            return mesh if mesh is unsplit or not is_flat(unsplit) else replace(mesh, unsplit=unsplit)
         count = len(mesh.positions) + int(np.sum(long))
         if count > limit:
             raise too_many_vertices(mesh.name, edge_length, limit)

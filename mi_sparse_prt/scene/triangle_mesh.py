@@ -28,6 +28,8 @@ class TriangleMesh:
     texcoords : (n, 2) float32 or None
     vertex_attributes, face_attributes : dict of name -> (n, k) or (t, k) float32
         Mesh attributes under Mitsuba's names (``vertex_color``, ``face_id``, ...).
+    unsplit : TriangleMesh or None
+        The same surface in fewer triangles, of one normal each: as it was before edges were bisected.
     """
 
     name: str
@@ -37,6 +39,7 @@ class TriangleMesh:
     texcoords: NDArray[np.float32] | None = None
     vertex_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     face_attributes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    unsplit: TriangleMesh | None = None
 
     def take_vertices(self, index: NDArray[np.integer], triangles: NDArray[np.integer]) -> TriangleMesh:
         """The mesh whose vertex k is this one's vertex ``index[k]``; ``triangles`` has the new numbers."""
@@ -47,6 +50,7 @@ class TriangleMesh:
             texcoords=None if self.texcoords is None else self.texcoords[index],
             vertex_attributes={k: v[index] for k, v in self.vertex_attributes.items()},
             triangles=np.ascontiguousarray(triangles, np.int32),
+            unsplit=None,
         )
 
     def take_triangles(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> TriangleMesh:
@@ -55,6 +59,7 @@ class TriangleMesh:
             self,
             triangles=np.ascontiguousarray(self.triangles[index]),
             face_attributes={k: v[index] for k, v in self.face_attributes.items()},
+            unsplit=None,
         )
 
 
@@ -74,6 +79,7 @@ def concatenated(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
         ]
         return {k: np.concatenate([a[k] for a in attributes]) for k in shared}
 
+    split = any(m.unsplit is not None for m in meshes)
     return TriangleMesh(
         first.name,
         np.concatenate([m.positions for m in meshes]),
@@ -82,6 +88,7 @@ def concatenated(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
         np.concatenate([m.texcoords for m in meshes if m.texcoords is not None]) if textured else None,
         joined([m.vertex_attributes for m in meshes]),
         joined([m.face_attributes for m in meshes]),
+        concatenated([m.unsplit or m for m in meshes]) if split else None,
     )
 
 
@@ -89,6 +96,13 @@ def triangle_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
     """(t, 3) cross products of the triangles' edges: along the face normal, twice the area long."""
     p = mesh.positions.astype(np.float64)[mesh.triangles]  # [triangle, corner, xyz]
     return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+
+
+def is_flat(mesh: TriangleMesh) -> bool:
+    """Whether the corners of each triangle have the same normal, within what rotations leave of it in float32."""
+    assert mesh.normals is not None
+    of_corners = mesh.normals[mesh.triangles]  # [triangle, corner, xyz]
+    return bool(np.abs(of_corners - of_corners[:, :1]).max(initial=0.0) < 1e-6)
 
 
 def normalise_rows(v: NDArray[np.float64]) -> NDArray[np.float64]:

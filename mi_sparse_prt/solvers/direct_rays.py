@@ -77,7 +77,7 @@ class DirectSolver:
     """
 
     def __init__(self, problem: Problem, strata: int = 2, seed: int = 0) -> None:
-        self.problem, self.scene = problem, problem.scene.normalised
+        self.problem, self.scene = problem, problem.scene.unsplit
         self.lighting, self.points = problem.emission, problem.points
         self.basis, self.seed = problem.basis, seed
         self.strata = strata if self.basis == "texel" else 1

@@ -94,7 +94,7 @@ class LampRays:
 
     def _arriving(self, ray: mi.Ray3f, lamp_at: mi.Point3f, active: mi.Mask) -> mi.Color3f:
         """The share of light that arrives along shadow rays: what masks, thin panes and ``null`` let through counts."""
-        scene = self._scene.normalised
+        scene = self._scene.unsplit
         if not self._scene.passes_straight:
             return dr.select(scene.ray_test(ray, active), mi.Color3f(0), 1)
         most = dr.opaque(mi.UInt32, self._max_depth - 2 if self._max_depth >= 0 else 1 << 30)
@@ -117,7 +117,7 @@ class LampPaths(PathSolver):
     """
 
     def __init__(self, problem: Problem, spp: int = 64, seed: int = 0) -> None:
-        self.problem, self.scene, self.points = problem, problem.scene.normalised, problem.points
+        self.problem, self.scene, self.points = problem, problem.scene.unsplit, problem.points
         self.spp, self.seed = spp, seed
         self.max_depth, self.channels = problem.max_depth, 3
         self._world, self._emission = problem.scene, problem.emission
@@ -166,11 +166,9 @@ def lamp_asked(
     lamp = dr.gather(mi.UInt32, unmet, place, active)
     uv = mi.Point2f(rng.next_float32(), rng.next_float32())
     towards, irradiance, distance = lamps.sample(lamp, scene.to_world(si.p), uv)
-    lit = active & ~scene.normalised.ray_test(
-        si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active
-    )
+    lit = active & ~scene.unsplit.ray_test(si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active)
     ray = si.spawn_ray(towards)
-    met, _ = lamp_met(problem, scene.normalised.ray_intersect(ray, lit), ray, lit)
+    met, _ = lamp_met(problem, scene.unsplit.ray_intersect(ray, lit), ray, lit)
     return lamp, towards, dr.select(lit & (met != mi.Int32(lamp)), irradiance * mi.Float(count), 0)
 
 

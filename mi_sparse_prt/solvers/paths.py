@@ -48,7 +48,7 @@ class PathSolver:
     """
 
     def __init__(self, problem: Problem, spp: int = 16, seed: int = 0) -> None:
-        self.problem, self.scene = problem, problem.scene.normalised
+        self.problem, self.scene = problem, problem.scene.unsplit
         self.lighting, self.points = problem.emission, problem.points
         self.basis, self.max_depth, self.channels = problem.basis, problem.max_depth, problem.channels
         self.spp, self.seed = spp, seed

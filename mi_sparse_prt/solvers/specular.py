@@ -61,7 +61,7 @@ class SpecularOptions:
         Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
 
-    first: int = 2
+    first: int = 1
     last: int = 16
     error: float = 0.0
     strata: int = 2

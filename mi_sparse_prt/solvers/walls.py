@@ -34,7 +34,7 @@ class Walls:
     """
 
     def __init__(self, scene: Scene, points: Points) -> None:
-        self._scene, self._points = scene.normalised, PointArrays(points)
+        self._scene, self._points = scene.unsplit, PointArrays(points)
 
     def between(self, first: Ids, second: Ids) -> NDArray[np.bool_]:
         """Whether something stands between points (m,) and points (m,) that face the same way, (m,) bool."""

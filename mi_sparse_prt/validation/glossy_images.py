@@ -278,7 +278,7 @@ class _References:
         place = mi.Point2f(np.stack([x.ravel(), y.ravel()]).astype(np.float32))
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), place, mi.Point2f(0.5))
         si = self._scene.mitsuba.ray_intersect(ray)
-        table = ShapeTable(self._scene.mitsuba, np.arange(len(self._scene.fronts)))
+        table = ShapeTable([self._scene.mitsuba], np.arange(len(self._scene.fronts)))
         number = table.gather(si.shape, si.is_valid()).numpy()
         shape = np.where(si.is_valid().numpy(), number.astype(np.int64), -1)
         return shape.reshape(height, width), np.array(si.sh_frame.n).T.reshape(height, width, 3)

@@ -24,7 +24,7 @@ def test_rays_find_the_numbers_of_shapes():
     hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(0, 0, -1)))
     order = [shape.id() for shape in scene.shapes()]
     expected = [order.index(name) for name in ("b", "a", "c")]
-    table = ShapeTable(scene, [10, 20, 30])
+    table = ShapeTable([scene], [10, 20, 30])
     assert table.gather(hit.shape, hit.is_valid()).numpy().tolist() == [10 * (i + 1) for i in expected] + [0]
     starts = np.cumsum([0] + [{"a": 12, "b": 2, "c": 12}[name] for name in order])
     found = first_triangles(scene).gather(hit.shape, hit.is_valid()).numpy()
