@@ -189,6 +189,9 @@ class _Attempts:
                 specular = specular_light(self._problem, run.seed, options)
                 if self._problem.reflection.terms:
                     specular = with_term_rows(self._problem, specular, run.seed)
+            if costs is not None and specular.seen is not None:
+                known = {how: cost.with_known_centres for how, cost in costs.direct.items()}
+                costs = replace(costs, direct=known)
         self._proposals = _proposals(settings, costs, 0.0 if specular is None else specular.error, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, specular)
 

@@ -104,6 +104,8 @@ class Execution:
         return replace(light, direct=factored)
 
     def _exact(self) -> MethodResult:
+        if self._problem.basis == "direction":
+            return self._centres(self._solver)
         return exact_direct(self._solver, self._run)
 
     def _consensus(self) -> MethodResult:

@@ -32,17 +32,26 @@ OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 @dataclass(frozen=True)
 class DirectCost:
-    """Seconds of all direct light, and its error relative to the whole matrix, L2."""
+    """Seconds of all direct light, and its error relative to the whole matrix, L2.
+
+    ``centres`` are those seconds that rays to texels' centres take.
+    """
 
     seconds: float
     error: float
+    centres: float = 0.0
+
+    @property
+    def with_known_centres(self) -> DirectCost:
+        """Where these rays have been traced for something else."""
+        return DirectCost(self.seconds - self.centres, self.error)
 
 
 def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     """All rays. In the texel basis there is an error, by the number of strata."""
     seconds = len(direct.points) * seconds_per_row(direct)
     if direct.basis == "direction":
-        return DirectCost(seconds, 0.0)
+        return DirectCost(seconds, 0.0, seconds)
     ours = direct.elements(np.repeat(held.vertices, held.texels.shape[1]), held.texels.ravel())
     square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
     return DirectCost(seconds, math.sqrt(max(square, 0.0)))
@@ -62,7 +71,7 @@ def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     edges = (time.perf_counter() - start) * len(direct.points) / len(bits)
     ours = part.elements(np.repeat(places, held.texels.shape[1]), held.texels.ravel())
     square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
-    return DirectCost(centres + edges, math.sqrt(max(square, 0.0)))
+    return DirectCost(centres + edges, math.sqrt(max(square, 0.0)), centres)
 
 
 def points_at(points: Points, ids: NDArray[np.integer]) -> Points:

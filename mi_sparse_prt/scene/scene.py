@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -316,16 +317,26 @@ class Scene:
         return [material.bsdf for material in self.materials[: len(self.fronts)] if material.rough_glass]
 
     @cached_property
-    def specular_surfaces(self) -> mi.Scene:
+    def specular_surfaces(self) -> mi.Scene | None:
         """Those of ``unsplit`` from which light goes on as it came, alone: rays that may meet one are found fast."""
-        which = [
-            k
-            for k, m in enumerate(self.materials[: len(self.fronts)])
-            if m.single_directions or m.rough_glass
-        ]
+        return self._unsplit_surfaces(lambda material: material.single_directions or material.rough_glass)
+
+    @cached_property
+    def passing_surfaces(self) -> mi.Scene | None:
+        """Those of ``unsplit`` that some light goes straight through."""
+        return self._unsplit_surfaces(lambda material: material.passes_straight)
+
+    @cached_property
+    def blocking_surfaces(self) -> mi.Scene | None:
+        """Those of ``unsplit`` that no light goes straight through."""
+        return self._unsplit_surfaces(lambda material: not material.passes_straight)
+
+    def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> mi.Scene | None:
+        """A scene of some surfaces of ``unsplit``, in the normalised frame; None for none."""
+        which = [k for k, material in enumerate(self.materials[: len(self.fronts)]) if belongs(material)]
         shapes = self.unsplit.shapes()
-        if len(which) == len(shapes):
-            return self.unsplit
+        if len(which) in (0, len(shapes)):
+            return self.unsplit if which else None
         return build_mitsuba_scene([shapes[k] for k in which], [self.fronts[k].name for k in which])
 
     @property
