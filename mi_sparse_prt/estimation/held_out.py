@@ -12,7 +12,7 @@ mean, (S - m)^2 - v estimates (S - s)^2.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -168,8 +168,8 @@ def _joined(records: list[Record]) -> Record:
 def estimate_errors(samples: Samples) -> HeldOutError:
     """Relative L2 errors and standard errors."""
     names = dict.fromkeys(name for name, _ in samples)
-    meshes = {name: relative([sample for (of, _), sample in samples.items() if of == name]) for name in names}
-    total = relative(_pooled(samples))
+    meshes = {name: _relative_of({k: s for k, s in samples.items() if k[0] == name}) for name in names}
+    total = _relative_of(samples)
     rows = max(sample.squares.shape[1] for sample in samples.values())
     glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
     return HeldOutError(
@@ -180,6 +180,13 @@ def estimate_errors(samples: Samples) -> HeldOutError:
         _shares(samples),
         [relative(glossy, row)[0] for row in range(2, rows)],
     )
+
+
+def _relative_of(samples: Samples) -> tuple[float, float]:
+    """Relative L2 and its standard error, of all parts."""
+    specular = {key: sample for key, sample in samples.items() if key[1] == "specular"}
+    others = {key: sample for key, sample in samples.items() if key not in specular}
+    return relative(_pooled(others), apart=_pooled(specular))
 
 
 def _shares(samples: Samples) -> dict[str, float]:
@@ -374,20 +381,29 @@ def _quadratic(gram: Doubles, first: Doubles, second: Doubles, products: Doubles
     return np.einsum("mabc,mac,mbc->m", gram, *pair, optimize=True)
 
 
-def relative(samples: list[Sample], row: int = 0) -> tuple[float, float]:
+def relative(samples: list[Sample], row: int = 0, apart: Sequence[Sample] = ()) -> tuple[float, float]:
     """Relative L2 and its standard error, from samples whose sums are added.
+
+    The squared error of ``apart`` is not below 0, as little as that of the others: what noise takes from one does not
+    hide the other.
 
     Its square R^2 is a ratio of two sums; to first order it spreads as the sum of e - R^2 n does, e and n being the
     squared error and norm of an element (Cochran 1977, "Sampling Techniques", 6.11).
     """
-    norm = sum(float((s.weights * s.norms[:, row]).sum()) for s in samples)
-    square = sum(float((s.weights * s.squares[:, row]).sum()) for s in samples)
+    every = [*samples, *apart]
+    norm = sum(float((s.weights * s.norms[:, row]).sum()) for s in every)
+    square = sum(
+        max(
+            sum(float((s.weights * s.squares[:, row]).sum()) for s in part), 0.0
+        )  # below zero is noise about zero
+        for part in (samples, apart)
+    )
     if norm <= 0:  # a black mesh
         return (0.0 if square <= 0 else 1.0), 0.0
-    ratio = max(square, 0.0) / norm  # below zero is noise about zero
+    ratio = square / norm
     found, spread = (
         float(np.sqrt(ratio)),
-        float(np.sqrt(sum(_variance(s, ratio, row) for s in samples))) / norm,
+        float(np.sqrt(sum(_variance(s, ratio, row) for s in every))) / norm,
     )
     # d sqrt(e) = de / (2 sqrt(e)); near zero the bound is that of sqrt(spread)
     return found, spread / (2 * found) if ratio > spread else float(np.sqrt(spread))

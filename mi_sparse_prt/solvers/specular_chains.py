@@ -256,7 +256,9 @@ class SpecularChains:
 
         To ask for these alone takes a fraction of the time of asking for what is met.
         """
-        some = self._scene.specular_surfaces.ray_test(ray)
+        surfaces = self._scene.specular_surfaces
+        assert surfaces is not None  # there is nothing to follow without one
+        some = surfaces.ray_test(ray)
         dr.eval(some, ray, *others)
         index = dr.compress(some)
         return [index, *(dr.gather(type(x), x, index) for x in (ray, *others))]

@@ -340,6 +340,22 @@ def test_parts_with_elements_of_their_own():
     assert parts == pytest.approx({"direct": 0.03**0.5, "indirect": 0.1})
 
 
+def test_noise_of_one_part_hides_no_other():
+    """
+    Expected: -0.02 of direct and indirect light, which is noise, takes nothing from 0.01 of light by way of mirrors;
+        but a negative product of errors of the first two counts.
+    """
+    direct = row_sample(np.full(50, 2.0), np.full(50, 0.03), np.full(50, 0.8))
+    indirect = row_sample(np.full(10, 10.0), np.full(10, -0.05), np.full(10, 0.1))
+    specular = row_sample(np.full(10, 10.0), np.full(10, 0.01), np.full(10, 0.1))
+    samples = {("a", "direct"): direct, ("a", "indirect"): indirect, ("a", "specular"): specular}
+    found = estimate_errors(samples)
+    assert found.total == pytest.approx(0.1)
+    assert found.meshes["a"] == pytest.approx(0.1)
+    less = {**samples, ("a", "indirect"): row_sample(np.full(10, 10.0), np.full(10, -0.01), np.full(10, 0.1))}
+    assert estimate_errors(less).total == pytest.approx(np.sqrt(0.03 - 0.01 + 0.01))
+
+
 @pytest.mark.parametrize("n", [80, 8192])
 def test_where_nothing_is_wrong_one_element_may_be(n):
     """Of n equal elements one, had it been wrong, would be a relative error of sqrt(1 / n). Dark ones do not count."""

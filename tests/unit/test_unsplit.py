@@ -1,12 +1,18 @@
 """Rays that need no vertices are traced in a scene of fewer triangles: they meet the same surfaces there."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import BALL, GROUND, T, build
+from conftest import BALL, GROUND, T, build, problem_at
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.core.bits import unpack
+from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.methods.brute_force import exact_direct
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 TEXTURED = {
     "type": "diffuse",
@@ -171,3 +177,58 @@ def test_matrices_are_the_same() -> None:
     )
     assert (np.abs(found - every) > 1e-6).mean() < 5e-4
     assert found.any()
+
+
+PANE = {
+    "type": "rectangle",
+    "to_world": T().translate([0, 1.2, 0]).rotate([1, 0, 0], 90).scale(0.6),
+    "bsdf": {"type": "thindielectric"},
+}
+LEAF = {
+    "type": "rectangle",
+    "to_world": T().translate([0.4, 0.8, 0.3]).rotate([1, 0, 0], -70).scale(0.4),
+    "bsdf": {
+        "type": "mask",
+        "opacity": {"type": "checkerboard", "color0": 0.0, "color1": 1.0},
+        "nested": {"type": "diffuse"},
+    },
+}
+
+
+def test_what_blocks_is_asked_for_apart() -> None:
+    """Rationale: light that passes panes and masks is told by rays among these alone, where nothing else is in the way.
+
+    Expected: bits, and light that passes in part, as of rays that look for all surfaces one after the other, but for 1
+        in 1000 elements.
+    """
+    scene = build(0.2, ground=GROUND, pane=PANE, leaf=LEAF, ball=BALL)
+    assert [s.id() for s in scene.passing_surfaces.shapes()] == ["pane", "leaf"]
+    assert [s.id() for s in scene.blocking_surfaces.shapes()] == ["ground", "ball"]
+    ids = np.arange(scene.n_vertices)
+    found = []
+    for _ in "ab":
+        problem = replace(problem_at(scene, prt.CubemapLighting(8)), specular_apart=True)
+        bits, passed = DirectSolver(problem).rows_and_passed(ids.astype(np.uint32))
+        light = np.zeros((scene.n_vertices * 384, passed.values.shape[1]))
+        light[passed.elements] = passed.values
+        found.append((unpack(bits, 384), light))
+        scene.__dict__ |= {"blocking_surfaces": None, "passing_surfaces": scene.unsplit}
+    (seen, light), (known, every) = found
+    assert (seen != known).mean() < 1e-3
+    assert (np.abs(light - every).max(axis=1) > 1e-6).mean() < 1e-3
+    assert (light > 0).any(axis=1).mean() > 0.02
+    assert 0.1 < seen.mean() < 0.5
+
+
+def test_rays_to_centres_are_traced_once() -> None:
+    """
+    Expected: direct light takes no rays more where those of light that passes have told it; it is that of a scene
+        without the memory of these.
+    """
+    scene = build(0.2, ground=GROUND, pane=PANE, leaf=LEAF)
+    lighting = prt.CubemapLighting(8)
+    matrix = prt.precompute(scene, lighting, target_error=0.5, progress=False)
+    assert matrix.report["rays"]["direct"] == 0
+    direct = exact_direct(DirectSolver(replace(problem_at(scene, lighting), specular_apart=True)), Run())
+    ids = np.arange(scene.n_vertices)
+    np.testing.assert_array_equal(matrix.operators["direct"].rows(ids), direct.direct.rows(ids))
