@@ -107,6 +107,7 @@ def _bisected(
         on_cube = dr.select(here <= 0.5, on_first, dr.lerp(middle, end, 2 * here - 1))
         seen, _ = direct.trace(point, dr.normalize(mi.Vector3f(on_cube)), mi.Mask(True))
         low = dr.select(seen == (kind == 1), here, low)
+        dr.eval(low)  # the next rays depend on it, and kernels on a GPU trace rays in one scene only
     return (low + 0.5 ** (STEPS + 1)).numpy()[:-1]
 
 

@@ -22,6 +22,7 @@ WALL = {
 }
 GLASS = {**BALL, "center": [-0.5, 0.4, 0.3], "bsdf": {"type": "roughdielectric", "alpha": 0.2}}
 MIRROR = {**BALL, "center": [0.6, 0.4, 0.1], "bsdf": {"type": "conductor"}}
+PANE = {"type": "rectangle", "to_world": T().translate([0, 0.3, 0.9]), "bsdf": {"type": "thindielectric"}}
 LIGHT = {
     "panel": {
         "type": "rectangle",
@@ -67,11 +68,15 @@ def test_two_scenes_in_a_kernel_are_noticed():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("kind", ["sky", "lamps"])
+@pytest.mark.parametrize("kind", ["sky", "panes", "lamps"])
 def test_precomputing_rendering_and_validating(kind):
-    """Rationale: corners behind walls are looked for by rays from the pixels; mirrors and glass lead rays to lamps."""
-    if kind == "sky":
-        scene = prt.Scene.from_mitsuba(lit_scene("sky"), 0.3)
+    """Rationale: corners behind walls are looked for by rays from the pixels; mirrors and glass lead rays to lamps.
+
+    What panes let through is told by rays among these, where others are not in the way.
+    """
+    if kind != "lamps":
+        shapes = {"pane": PANE, "glass": GLASS, "mirror": MIRROR} if kind == "panes" else {}
+        scene = prt.Scene.from_mitsuba(lit_scene("sky", **shapes), 0.3)
         emission, options = prt.CubemapLighting(2), {"basis": "texel"}
     else:
         scene = prt.Scene.from_mitsuba(lit_scene("panel", "bulb", glass=GLASS, mirror=MIRROR), 0.3)
