@@ -14,7 +14,6 @@ METHODS = ("auto", *BY_NAME)
 BASES = ("direction", "texel")
 SPP = 16
 TARGET = 0.02  # error to aim at, where none is given
-SPECULAR_NOISE = 0.1  # relative L2, of light that arrives by way of mirrors and glass
 AUTO_TERMS = "auto"
 
 
@@ -110,12 +109,9 @@ class Settings:
 
     @property
     def specular(self) -> SpecularOptions:
-        """How light that arrives by way of mirrors and glass is looked for.
-
-        It is sharp: a tenth of itself as noise is enough, though it may be above the target, as is told then.
-        """
+        """How light that arrives by way of mirrors and glass is looked for."""
         half = (self.target_error or TARGET) / math.sqrt(2)  # of the squared error
-        return SpecularOptions(error=half, own=SPECULAR_NOISE)
+        return SpecularOptions(error=half)
 
     @property
     def view_dependent(self) -> bool:

@@ -57,8 +57,6 @@ class SpecularOptions:
         At most; cells from which more light arrives have more, until the noise is small enough.
     error : float
         Noise that is small enough: relative L2, of direct and specular light together.
-    own : float
-        The same of light that arrives around corners, relative to that light alone: either is enough.
     strata : int
         Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
@@ -66,7 +64,6 @@ class SpecularOptions:
     first: int = 1
     last: int = 16
     error: float = 0.0
-    own: float = 0.0
     strata: int = 2
 
 
@@ -113,14 +110,13 @@ class SpecularLight:
 
 
 class _Limit(NamedTuple):
-    """What squared noise may be: a share of the squared norm of light, and a number; or another share alone."""
+    """What squared noise may be: a share of the squared norm of light, and a number."""
 
     share: float
     number: float
-    alone: float = 0.0
 
     def of(self, square: float) -> float:
-        return max(self.share * square + self.number, self.alone * square)
+        return self.share * square + self.number
 
 
 class _Estimate(NamedTuple):
@@ -163,11 +159,7 @@ def specular_light(
     limit = _Limit(share, share * direct)
     found, seen = [], None
     if problem.scene.bends_light:
-        found.append(
-            _Arriving(problem, every, power, seeds[:32]).refined(
-                options, limit._replace(alone=options.own**2)
-            )
-        )
+        found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
     if passes:
         passing = _Passing(problem, every, power, seeds[32:])
         found.append(passing.refined(options, limit))
