@@ -322,9 +322,8 @@ class SpecularChains:
 
         Of lamps, those that are asked at a surface come apart, before those that rays meet after it.
         """
-        scene = (
-            self._scene.unsplit if to_light else self._scene.normalised
-        )  # whose triangles have the vertices
+        # triangles of the normalised scene have the vertices
+        scene = self._scene.unsplit if to_light else self._scene.normalised
         index, ray, of, rng = self._towards_specular(ray, of, rng)
         hit = scene.ray_intersect_preliminary(ray)
         weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
