@@ -13,6 +13,7 @@ from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.brute_force import exact_direct
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.specular_chains import SpecularChains
 
 TEXTURED = {
     "type": "diffuse",
@@ -232,3 +233,30 @@ def test_rays_to_centres_are_traced_once() -> None:
     direct = exact_direct(DirectSolver(replace(problem_at(scene, lighting), specular_apart=True)), Run())
     ids = np.arange(scene.n_vertices)
     np.testing.assert_array_equal(matrix.operators["direct"].rows(ids), direct.direct.rows(ids))
+
+
+@pytest.mark.parametrize("max_depth", [4, -1], ids=["by depth", "without a limit"])
+def test_chains_in_one_kernel_are_those_surface_by_surface(max_depth: int) -> None:
+    """Rationale: rays to the sky are followed in a loop on the device, others from one surface to the next.
+
+    Expected: the same rays bring the same light to each point from each texel, after as many surfaces; glass, a mirror
+        behind it, and a mask send them on. Sums differ by what fixed-point numbers leave out.
+    """
+    ball = {**BALL, "bsdf": {"type": "dielectric"}}
+    scene = build(0.3, ground=GROUND, ball=ball, mirror=MIRROR, leaf=LEAF)
+    problem = replace(problem_at(scene, prt.CubemapLighting(4), max_depth=max_depth), specular_apart=True)
+    chains, ids = SpecularChains(problem), np.arange(scene.n_vertices)
+    cells = chains.find_cells(ids, 1)
+    strata = np.full(len(cells.rows), 2)
+    light = chains.gather_light(ids, cells, strata, 2).light
+    depths = max(problem.depths_apart, 1)
+    known = np.zeros((3, scene.n_vertices, depths, 96))
+    for depth, ends in enumerate(chains._follow(*chains._rays_into(ids, cells, strata, 2), True)):
+        kept = ends.valid.numpy()
+        place = cells.rows[ends.of.numpy()[kept]], min(depth, depths - 1), ends.column.numpy()[kept]
+        for c in range(3):
+            np.add.at(known[c], place, ends.weight.numpy()[c, kept] / (16 * 2) ** 2)
+    for c in range(3):
+        np.testing.assert_allclose(light[c].toarray().reshape(known[c].shape), known[c], atol=1e-5)
+    shares = known.sum(axis=(0, 1, 3))
+    assert (shares > 0.01 * shares.sum()).all()
