@@ -74,7 +74,7 @@ def measure(path: Path, resolution: int, target: float, basis: str, rows: int) -
         "ratio": seconds / bare,
         "told": transport.report["estimated_error"]["total"],
         "found": found and found["relative_l2"]["total"],
-        "noise": found and found["reference_noise"]["total"],
+        "noise": found and found["reference_noise"],
         "plan": str(transport.report["plan"]),
         "phases": transport.report["seconds"],
         "peak_gigabytes": peak_memory() / 1e9,

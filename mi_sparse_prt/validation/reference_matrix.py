@@ -15,6 +15,7 @@ from mi_sparse_prt.emission.space import EmissionSpace
 from mi_sparse_prt.measurement.vertices import VertexRays, vertex_rays
 from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.validation.diffuse_patches import diffuse_patches
 
 Floats = NDArray[np.float32]
 
@@ -31,7 +32,8 @@ class ReferenceMatrix:
     basis : {"direction", "texel"}
     max_depth : int
     rows : (k,) integers
-        Vertices, seen through the ``mesh_vertices`` sensor, or pixels of the camera.
+        Vertices, seen through the ``mesh_vertices`` sensor, or pixels of the camera. Under a cubemap, those that
+        are not diffuse get a ``diffuse_patches`` triangle each.
     rays : VertexRays, optional
         Of all vertices of ``scene.normalised``, or of ``scene.mitsuba`` for lamps, if they are known already.
     camera : mi.Sensor, optional
@@ -53,14 +55,17 @@ class ReferenceMatrix:
         self._only_lights = mi.load_dict({"type": "path", "max_depth": 1})
         distant, self._camera = emission.kind == "cubemap", camera
         self._sees_lights = camera is not None or not distant
-        if distant:
-            self._sky = self._under_a_sky(
-                scene.normalised.shapes() if camera is None else scene.unlit_shapes()
-            )
-            self._parameters = mi.traverse(self._sky)
         if camera is None:
+            rays = rays or vertex_rays(scene.normalised if distant else scene.mitsuba, scene)
+        if distant:
+            shapes = scene.unlit_shapes()
+            if rays is not None:
+                paint = diffuse_patches(scene, rays, rows)
+                shapes = [*scene.normalised.shapes(), *([] if paint is None else [paint])]
+            self._sky = self._under_a_sky(shapes)
+            self._parameters = mi.traverse(self._sky)
+        if rays is not None:
             lit = self._sky if distant else scene.mitsuba
-            rays = rays or vertex_rays(scene.normalised if distant else lit, scene)
             self._vertices = mi.load_dict({"type": "mesh_vertices", "vertices": len(rows)})
             self._vertices.bind(lit, rays.take(rows))
 

@@ -132,7 +132,8 @@ def validate(
     Notes
     -----
     Mitsuba sees a vertex through a ray that ends beside it, and light that grazes an edge there may miss the vertex.
-    So the matrix is compared with its direct part moved to these hits, and what the move changes is reported
+    Rows take vertices for diffuse, so those of other materials are seen under a speck of paint (``diffuse_patches``).
+    The matrix is compared with its direct part moved to these hits, and what the move changes is reported
     apart: ``hit_against_vertex``, in relative L2 of the matrix. ``direct_at_hits`` is our direct part there against
     Mitsuba's (without noise, in the direction basis): the share of elements that differ by more than 1e-4. Matrices of
     pixels have neither, those of lamps no ``direct_at_hits``.
@@ -199,17 +200,22 @@ def _left_out(scene: Scene, transport: LightTransport) -> list[str]:
             "Mitsuba's directional lights do not shine through glass and masks, nor by way of mirrors: "
             'validate a matrix of basis="texel"'
         )
-    names = [k.name for k in scene.materials[: len(scene.fronts)] if k.single_directions]
-    if not names or transport.measurement.kind != "vertices":
+    if transport.emission.kind == "cubemap" or transport.measurement.kind != "vertices":
         return []
-    return [f"rows of mirrors, glass and masks, whose radiance comes from other places: {', '.join(names)}"]
+    names = [k.name for k in scene.materials[: len(scene.fronts)] if not k.diffuse]
+    return (
+        [f"rows of surfaces that are not diffuse, of which lamps are reflected: {', '.join(names)}"]
+        if names
+        else []
+    )
 
 
 def _chosen_rows(
     scene: Scene, transport: LightTransport, n_rows: int, sensor: int | mi.Sensor, rng: np.random.Generator
 ) -> _Rows:
     if transport.measurement.kind == "vertices":
-        seen = [m for m, k in zip(transport.meshes, scene.materials, strict=True) if not k.single_directions]
+        every = transport.emission.kind == "cubemap"
+        seen = [m for m, k in zip(transport.meshes, scene.materials, strict=True) if every or k.diffuse]
         ids = _stratified_vertices(tuple(seen) or transport.meshes, n_rows, rng)
         return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised, scene))
     if transport.measurement.image is None:

@@ -212,6 +212,34 @@ def test_coarse_indirect_light(scene):
     assert report["relative_l2"]["total"] > 1.5 * fine
 
 
+METAL = {"type": "roughconductor", "material": "Au", "alpha": 0.3}
+LACQUER = {
+    "type": "roughplastic",
+    "diffuse_reflectance": {"type": "rgb", "value": [0.6, 0.2, 0.1]},
+    "alpha": 0.2,
+}
+MIRROR = {"type": "conductor", "material": "Ag"}
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_rows_of_surfaces_that_are_not_diffuse():
+    """Their rows are of vertices that are diffuse, among surfaces as they are: lobes at vertices are no error."""
+    shapes = still_life(COLOURS)
+    shapes["ground"]["bsdf"] = {"type": "twosided", "bsdf": LACQUER}
+    shapes["box"]["bsdf"] = METAL
+    wall = T().translate([0, 0.8, -1.5]).scale(0.7)
+    shapes["mirror"] = {"type": "rectangle", "to_world": wall, "bsdf": MIRROR}
+    scene = build(**shapes)
+    transport = precomputed(scene, basis="texel", spp=1024)
+    told = transport.report["estimated_error"]
+    report = validated(scene, transport, n_rows=60, image=False).report
+    assert report["left_out"] == []
+    assert report["relative_l2"]["total"] == pytest.approx(told["total"], rel=0.15)
+    for name in ("ground", "box"):
+        assert report["relative_l2"]["meshes"][name] == pytest.approx(told["meshes"][name], rel=0.3)
+    assert report["relative_l2"]["meshes"]["mirror"] == 0
+
+
 @pytest.mark.usefixtures("no_held_out")
 def test_rows_in_another_order(scene):
     """A matrix is validated against a scene whose shapes come the other way round."""
