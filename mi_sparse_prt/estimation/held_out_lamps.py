@@ -25,19 +25,27 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     stream = random_stream(seed, HELD_OUT)
     rng, m, seeds = np.random.default_rng(stream), problem.emission.size, element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
-    samples, groups = {}, transport.measurement.groups
+    groups = transport.measurement.groups
     most = int(np.clip(ELEMENTS // (m * len(groups)), 2, POINTS))
-    for group in groups:
-        size = group.vertices.stop - group.vertices.start
-        ids = group.vertices.start + np.sort(rng.choice(size, min(size, most), replace=False))
-        asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
-        ours = transport.incident.elements(*asked).astype(np.float64)
-        x, y = (_true(problem, asked, *pair) for pair in (seeds[:2], seeds[2:]))
-        power = albedo[asked[0]] ** 2
-        squares, norms = ((power * a * b).sum(axis=1) for a, b in ((ours - x, ours - y), (x, y)))
-        weights = np.full(len(asked[0]), size / len(ids))
-        samples[group.name, "all"] = Sample(weights, squares[:, None], norms[:, None])
-    return estimate_errors(samples)
+    sizes = np.array([group.vertices.stop - group.vertices.start for group in groups])
+    counts = np.minimum(sizes, most)
+    drawn = [
+        np.sort(rng.choice(size, count, replace=False)) for size, count in zip(sizes, counts, strict=True)
+    ]
+    ids = np.concatenate([group.vertices.start + some for group, some in zip(groups, drawn, strict=True)])
+    asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
+    # those of all groups at once: each evaluation starts dozens of kernels
+    ours = transport.incident.elements(*asked).astype(np.float64)
+    x, y = (_true(problem, asked, *pair) for pair in (seeds[:2], seeds[2:]))
+    power = albedo[asked[0]] ** 2
+    sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x, ours - y), (x, y)))
+    weights = np.repeat(sizes / counts, m * counts)
+    columns = weights, *(column[:, None] for column in sums)
+    ends = np.cumsum(m * counts)[:-1]
+    parts = zip(*(np.split(column, ends) for column in columns), strict=True)
+    return estimate_errors(
+        {(group.name, "all"): Sample(*part) for group, part in zip(groups, parts, strict=True)}
+    )
 
 
 def _true(problem: Problem, asked: tuple[Any, Any], rays: int, paths: int) -> NDArray[np.float64]:
