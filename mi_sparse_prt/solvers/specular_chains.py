@@ -325,11 +325,11 @@ class SpecularChains:
         # triangles of the normalised scene have the vertices
         scene = self._scene.unsplit if to_light else self._scene.normalised
         index, ray, of, rng = self._towards_specular(ray, of, rng)
+        if len(index) == 0:  # no rays at all end the process if they are traced
+            return
         hit = scene.ray_intersect_preliminary(ray)
         weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
         for _ in range(self._longest):
-            if len(index) == 0:
-                return
             si = hit.compute_surface_interaction(ray, active=hit.is_valid())
             if to_light and self._asks:
                 yield self._of_lamps_asked(si, of, weight, rng)
@@ -347,6 +347,8 @@ class SpecularChains:
             dr.eval(of, column, weight, brought, ends, alive, ray, rng, straight, hit)
             yield _Ends(of, column, brought, ends)
             index = dr.compress(alive)
+            if len(index) == 0:
+                return
             of, weight, straight, ray, rng, hit = (
                 dr.gather(type(x), x, index) for x in (of, weight, straight, ray, rng, hit)
             )

@@ -13,7 +13,7 @@ from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.brute_force import exact_direct
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.specular_chains import SpecularChains
+from mi_sparse_prt.solvers.specular_chains import Cells, SpecularChains, specular_form_factors
 
 TEXTURED = {
     "type": "diffuse",
@@ -260,3 +260,22 @@ def test_chains_in_one_kernel_are_those_surface_by_surface(max_depth: int) -> No
         np.testing.assert_allclose(light[c].toarray().reshape(known[c].shape), known[c], atol=1e-5)
     shares = known.sum(axis=(0, 1, 3))
     assert (shares > 0.01 * shares.sum()).all()
+
+
+def test_points_that_see_no_specular_surface() -> None:
+    """
+    Rationale: blocks of points may have no ray towards one, and the process ends where no rays at all are traced.
+
+    Expected: no light and no surfaces at the ground, whose horizon hides a mirror below it.
+    """
+    below = {**MIRROR, "to_world": T().translate([0, -1, 0]).scale(0.3)}
+    scene = build(0.3, ground=GROUND, mirror=below)
+    problem = replace(problem_at(scene, prt.CubemapLighting(4)), specular_apart=True)
+    ids = np.arange(scene.meshes[0].vertices.stop)
+    for matrix in specular_form_factors(problem, ids, 64, 1):
+        assert matrix.shape == (len(ids), scene.n_vertices)
+        assert matrix.nnz == 0
+    cells = Cells(np.zeros(4, np.int64), np.arange(4), np.ones(4, np.float32))
+    chains = SpecularChains(problem)
+    assert len(chains.find_cells(ids, 1).rows) == 0
+    assert chains.gather_light(ids[:1], cells, np.ones(4, np.int64), 2).light[0].nnz == 0
