@@ -11,13 +11,15 @@ from mi_sparse_prt.core.threads import run_in_parts
 
 Floats = NDArray[np.float32]
 
+SLAB = 512  # columns of light at a time: more of it stays in the cache
+
 
 def multiply_sparse(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
     """A sparse matrix (n, m) times a dense one (m, k), float32; the same for any number of threads."""
     return multiply_scaled(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
 
 
-def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, slab: int = 512) -> Floats:
+def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
     """G rho x for several albedos rho and one light x, of which each row is read once for all of them.
 
     Parameters
@@ -28,25 +30,39 @@ def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Float
         The diagonals of rho.
     light : (m, k) float32
         x.
-    slab : int
-        Columns of x at a time: more of it stays in the cache.
 
     Returns
     -------
     (channels, n, k) float32
         The same for any number of threads.
     """
+    result = np.empty((len(albedo), matrix.shape[0], light.shape[1]), np.float32)
+    _multiply_into(matrix, albedo, light, result, 0, False)
+    return result
+
+
+def add_scaled(
+    matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int
+) -> None:
+    """Add what ``multiply_scaled`` returns to n rows of a result (channels, ..., k), from ``row`` on."""
+    _multiply_into(matrix, albedo, light, result, row, True)
+
+
+def _multiply_into(
+    matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int, add: bool
+) -> None:
     if light.shape[1] < 8:  # columns that are not worth a second thread
-        return np.stack([matrix @ (rho[:, None] * light) for rho in albedo])
+        part = result[:, row : row + matrix.shape[0]]
+        found = np.stack([matrix @ (rho[:, None] * light) for rho in albedo])
+        part[:] = part + found if add else found
+        return
     shares = np.linspace(0, matrix.nnz, numba.get_num_threads() + 1)
     bounds = np.searchsorted(matrix.indptr, shares)  # equal numbers of entries, not of rows
     bounds[0], bounds[-1] = 0, matrix.shape[0]
-    result = np.empty((len(albedo), matrix.shape[0], light.shape[1]), np.float32)
-    for a in range(0, light.shape[1], slab):
-        some = np.ascontiguousarray(light[:, a : a + slab], np.float32)
+    for a in range(0, light.shape[1], SLAB):
+        some = np.ascontiguousarray(light[:, a : a + SLAB], np.float32)
         arrays = bounds, matrix.indptr, matrix.indices, matrix.data, albedo, some, result
-        run_in_parts(_multiply, len(shares) - 1, *arrays, a)
-    return result
+        run_in_parts(_multiply, len(shares) - 1, *arrays, row, a, add)
 
 
 @numba.njit(nogil=True, fastmath={"contract"}, cache=True)
@@ -60,11 +76,14 @@ def _multiply(
     albedo: Floats,
     light: Floats,
     result: Floats,
+    row: int,
     column: int,
+    add: bool,
 ) -> None:
     """Rows bounds[t] to bounds[t + 1] as the t-th part; four entries at a time, so that sums are stored less often.
 
-    Into columns of the result from ``column`` on, which is whole: slices are contiguous or not, and compiled twice.
+    Into rows and columns of the result from ``row`` and ``column`` on, which is whole: slices are contiguous or not,
+    and compiled twice.
     """
     width = light.shape[1]
     total = np.empty((len(albedo), width), np.float32)
@@ -90,4 +109,5 @@ def _multiply(
                 e += 1
             for h in range(len(albedo)):  # not a slice: its error message alone compiles for seconds
                 for k in range(width):
-                    result[h, i, column + k] = total[h, k]
+                    before = result[h, row + i, column + k] if add else np.float32(0)
+                    result[h, row + i, column + k] = before + total[h, k]

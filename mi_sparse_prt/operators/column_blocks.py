@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.operators.operator import Floats, Operator
 
 BLOCK = 1 << 22  # elements at a time; 16 MB stay in the cache until they are used
@@ -45,13 +44,12 @@ class ColumnBlocks:
             yield part, self.at(np.arange(part.start, part.stop))
 
 
-def random_combinations(direct: Operator, few: int, rng: np.random.Generator) -> Floats:
-    """Sums of few random columns each, with random signs: (rows, k), at most a word's bits of them.
+def combine_randomly(direct: Operator, few: int, rng: np.random.Generator, out: Floats) -> None:
+    """Sums of few random columns each, with random signs, into ``out`` (rows, k), k being a word's bits.
 
     The columns of a sum are at the same place in random words of bits, so that words are read as a whole.
     """
-    m = direct.shape[1]
-    width = min(BITS, m)
-    words = rng.permutation(m // width)[:few]
+    width = out.shape[1]
+    words = rng.permutation(direct.shape[1] // width)[:few]
     signs = rng.choice(np.array([-1, 1], np.float32), (len(words), width))
-    return direct.combined(words, signs)
+    direct.combine(words, signs, out)

@@ -84,6 +84,24 @@ class FractionalVisibility(Operator):
         power[:, : len(lighting)] = (lighting * self._weights()[:, None]).T
         return _relight(self.seen, self.normals, directions, falloffs, power)
 
+    def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
+        directions, falloffs = _means(self.lighting.resolution)
+        texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
+        place = np.full(-(-self.lighting.n_directions // signs.shape[1]), -1)
+        place[words] = np.arange(len(words))
+        arrays = (
+            place,
+            np.moveaxis(directions[:, texels], 0, 1),
+            falloffs[texels],
+            signs * self._weights()[texels],
+        )
+        result = np.zeros((len(self.bits), signs.shape[1]), np.float32)
+        words = np.asarray(words, np.int64)
+        run_in_parts(
+            _combine, len(result), self.seen, self.normals, words, *map(np.ascontiguousarray, arrays), result
+        )
+        return result
+
     def masked(self, points: NDArray[np.int64], open: Bits) -> FractionalVisibility:
         bits, shares = self.bits.copy(), self.shares.copy()
         bits[points] &= open
@@ -230,6 +248,45 @@ def _expand(
                 cosine = nx * directions[0, c] + ny * directions[1, c] + nz * directions[2, c]
                 share = np.float32(shares[e]) / np.float32(FULL)
                 result[i, c] = share * _mean_cosine(cosine, falloffs[c]) * weights[c]
+
+
+@numba.njit(nogil=True, fastmath=True, cache=True)
+def _combine(
+    first: int,
+    last: int,
+    seen_texels: SeenTexels,
+    normals: Floats,
+    words: NDArray[np.int64],
+    place: NDArray[np.int64],
+    directions: Floats,
+    falloffs: Floats,
+    power: Floats,
+    result: Floats,
+) -> None:
+    """Sums (n, k) over words of the elements at their bits, times powers (words, k).
+
+    Directions (words, 3, k) and falloffs are of the same texels; ``place`` says which of the words one is, or -1.
+    """
+    bits, starts, texels, shares = seen_texels
+    width = power.shape[1]
+    for i in range(first, last):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        for g in range(len(words)):
+            mask = bits[i, words[g]]
+            if mask == 0:
+                continue
+            for k in range(width):
+                cosine = nx * directions[g, 0, k] + ny * directions[g, 1, k] + nz * directions[g, 2, k]
+                seen = power[g, k] * np.float32((mask >> np.uint32(k)) & np.uint32(1))
+                result[i, k] += _mean_cosine(cosine, falloffs[g, k]) * seen
+        for e in range(starts[i], starts[i + 1]):
+            word = texels[e] // width
+            g, k = place[word], texels[e] - word * width
+            if g < 0:
+                continue
+            cosine = nx * directions[g, 0, k] + ny * directions[g, 1, k] + nz * directions[g, 2, k]
+            more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[i], texels[e]))
+            result[i, k] += _mean_cosine(cosine, falloffs[g, k]) * power[g, k] * more
 
 
 @numba.njit(nogil=True, cache=True)

@@ -212,6 +212,10 @@ class Operator(ABC):
             total += self.dense_columns(some, room) * sign
         return total
 
+    def combine(self, words: NDArray[np.integer], signs: Floats, out: Floats) -> None:
+        """What ``combined`` returns, into part of a larger array."""
+        out[:] = self.combined(words, signs)
+
     def _apply(self, x: Floats) -> Floats:
         """Products (rows, channels, k) with vectors (n_directions, channels, k), by blocks of rows."""
         result = np.empty((self.shape[0], *x.shape[1:]), np.float32)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
-from mi_sparse_prt.operators.column_blocks import ColumnBlocks, random_combinations
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks, combine_randomly
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.solvers.stacked import StackedFormFactors
 
@@ -99,7 +99,7 @@ class FirstBounce:
 def first_bounce(
     matrix: StackedFormFactors,
     albedo: Floats,
-    direct: Operator,
+    lights: Sequence[Operator],
     keys: NDArray[np.uint64],
     tolerance: float,
     seed: int,
@@ -112,8 +112,8 @@ def first_bounce(
     matrix : StackedFormFactors (n, n_v)
         G.
     albedo : (channels, n_v) float32
-    direct : Operator
-        D.
+    lights : sequence of Operator
+        D of each channel, or one of all.
     keys : (n,) uint64
         Of the rows of G: random numbers are made of them.
     tolerance : float
@@ -127,20 +127,20 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrix, albedo, direct, hashes, rng, tolerance, options)
+    columns, turn, missed = _basis(matrix, albedo, lights, hashes, rng, tolerance, options)
     count = options.row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
-    right = [fit @ known for known in _rows(matrix.rows(rows), albedo, direct)]
+    right = [fit @ known for known in _rows(matrix.rows(rows), albedo, lights)]
     return _truncated(columns, turn, right, missed, tolerance)
 
 
 def _basis(
     matrix: StackedFormFactors,
     albedo: Floats,
-    direct: Operator,
+    lights: Sequence[Operator],
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
@@ -159,10 +159,10 @@ def _basis(
     blocks: list[Floats] = []  # [row, combination]
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
-    draws, width = max(1, options.draws // len(albedo)), min(BITS, direct.shape[1])
+    draws, width = max(1, options.draws // len(albedo)), min(BITS, lights[0].shape[1])
     mixed = np.empty((matrix.shape[1], draws * width), np.float32)
     while True:
-        block = _combinations(matrix, albedo, direct, mixed, options.mixed, rng)
+        block = _combinations(matrix, albedo, lights, mixed, options.mixed, rng)
         new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
@@ -196,7 +196,7 @@ def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | No
 def _combinations(
     matrix: StackedFormFactors,
     albedo: Floats,
-    direct: Operator,
+    lights: Sequence[Operator],
     mixed: Floats,
     few: int,
     rng: np.random.Generator,
@@ -205,10 +205,10 @@ def _combinations(
 
     ``mixed`` (n_v, combinations of a channel) is overwritten.
     """
-    found, width = [], min(BITS, direct.shape[1])
-    for rho in albedo:
+    found, width = [], min(BITS, lights[0].shape[1])
+    for c, rho in enumerate(albedo):
         for a in range(0, mixed.shape[1], width):
-            mixed[:, a : a + width] = random_combinations(direct, few, rng)
+            combine_randomly(lights[min(c, len(lights) - 1)], few, rng, mixed[:, a : a + width])
         found.append(matrix.reflect(rho[None], mixed)[0])
     return found[0] if len(found) == 1 else np.hstack(found)
 
@@ -252,15 +252,17 @@ def _chosen_rows(
     return rows, -np.expm1(-rate[rows] * arrival[order[count]])
 
 
-def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, direct: Operator) -> Floats:
+def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, lights: Sequence[Operator]) -> Floats:
     """G rho D (channels, s, n_directions) for some rows (s, n_v) of G, from those rows of D that they touch."""
     touched, columns = np.unique(matrix.indices, return_inverse=True)
     shape = matrix.shape[0], len(touched)
     local = scipy.sparse.csr_array((matrix.data, columns.astype(np.int32), matrix.indptr), shape=shape)
-    rho = np.ascontiguousarray(albedo[:, touched])
-    result = np.empty((len(rho), shape[0], direct.shape[1]), np.float32)
-    for texels, light in ColumnBlocks(direct.take(touched)):
-        result[:, :, texels] = multiply_scaled(local, rho, light)
+    result = np.empty((len(albedo), shape[0], lights[0].shape[1]), np.float32)
+    for c, direct in enumerate(lights):
+        own = slice(c, c + 1) if len(lights) > 1 else slice(None)
+        rho = np.ascontiguousarray(albedo[own][:, touched])
+        for texels, light in ColumnBlocks(direct.take(touched)):
+            result[own][..., texels] = multiply_scaled(local, rho, light)
     return result
 
 

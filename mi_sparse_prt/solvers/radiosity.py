@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
+from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.low_rank import LowRank
@@ -255,31 +255,24 @@ class FiniteElements:
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         keys = self._keys[self.nodes.ids]
         matrix = StackedFormFactors([self.matrix])
-        first = first_bounce(matrix, self._albedo, direct, keys, tolerance, self.seed, self.options.basis)
+        first = first_bounce(matrix, self._albedo, [direct], keys, tolerance, self.seed, self.options.basis)
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
 
     def _by_depth(self, lights: Sequence[Operator], tolerance: float) -> GatheredByDepth:
         """Indirect light that met 1, 2, ... surfaces, from light E_0, E_1, ... that met as many specular ones."""
-        colours = max(light.shape[2] for light in lights)
-        if colours == 1:
-            return self._by_depth_of(lights, self._albedo, tolerance)
-        found = []
-        for c in range(colours):
-            own = [light.channel(c) if isinstance(light, SparseRows) else light for light in lights]
-            found.append(self._by_depth_of(own, self._albedo[[min(c, self.channels - 1)]], tolerance))
-        return joined_channels(found)
-
-    def _by_depth_of(self, lights: Sequence[Operator], albedo: Floats, tolerance: float) -> GatheredByDepth:
-        """``_by_depth`` of light of one channel."""
-        count = len(lights)
+        count, colours = len(lights), max(light.shape[2] for light in lights)
         lit = [t for t, light in enumerate(lights) if t == 0 or not _is_dark(light)]
+        albedo, stacks = self._albedo, [Stacked(tuple(lights[t] for t in lit))]
+        if colours > 1:
+            albedo = albedo[np.minimum(np.arange(colours), self.channels - 1)]
+            stacks = [Stacked(tuple(_channel(lights[t], c) for t in lit)) for c in range(colours)]
         keys = self._keys[self.nodes.ids]
         first = first_bounce(
             StackedFormFactors(self._matrices, lit, count),
             np.tile(albedo, len(lit)),
-            Stacked(tuple(lights[t] for t in lit)),
+            stacks,
             np.concatenate([mix(keys + np.uint64(s)) if s else keys for s in range(count)]),
             tolerance,
             self.seed,
@@ -306,7 +299,15 @@ class FiniteElements:
         """Add what light of a depth, the first being 0, becomes by one bounce and some specular surfaces after it."""
         energies = [_energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
         for x, rho, kept in zip(light, albedo, all_but_least(energies, least), strict=True):
-            if kept.any():
+            if kept.all():
+                add_scaled(
+                    self._matrices[met],
+                    rho[None],
+                    self.nodes.interpolate(x[depth]),
+                    x[depth + 1 + met][None],
+                    0,
+                )
+            elif kept.any():
                 some = self.nodes.interpolate(np.ascontiguousarray(x[depth][:, kept]))
                 x[depth + 1 + met][:, kept] += multiply_scaled(self._matrices[met], rho[None], some)[0]
 
@@ -470,7 +471,7 @@ class RadiositySolver(FiniteElements):
         first = first_bounce(
             StackedFormFactors([matrix]),
             self._albedo,
-            lit,
+            [lit],
             points.keys,
             tolerance,
             self.seed,
@@ -488,6 +489,11 @@ class RadiositySolver(FiniteElements):
             first.left_out,
             before.bounces + 1,
         )
+
+
+def _channel(light: Operator, number: int) -> Operator:
+    """One channel alone, of light that may have one for all."""
+    return light.channel(number) if isinstance(light, SparseRows) else light
 
 
 def _is_dark(light: Operator) -> bool:

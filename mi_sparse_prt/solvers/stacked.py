@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.sparse_product import multiply_scaled
+from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
@@ -47,7 +47,15 @@ class Stacked(Operator):
         return np.concatenate([part.columns(ids) for part in self.parts])
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
-        return np.concatenate([part.combined(words, signs) for part in self.parts])
+        result = np.empty((self.shape[0], signs.shape[1]), np.float32)
+        self.combine(words, signs, result)
+        return result
+
+    def combine(self, words: NDArray[np.integer], signs: Floats, out: Floats) -> None:
+        end = 0
+        for part in self.parts:
+            start, end = end, end + part.shape[0]
+            part.combine(words, signs, out[start:end])
 
     def take(self, ids: Ids) -> Stacked:
         """Some rows, by ascending numbers: those of each part stay together."""
@@ -95,8 +103,7 @@ class StackedFormFactors:
         for s, blocks in enumerate(self._blocks):
             for i, matrix in blocks:
                 part = slice(i * columns, (i + 1) * columns)
-                rho = np.ascontiguousarray(albedo[:, part])
-                result[:, s * n : (s + 1) * n] += multiply_scaled(matrix, rho, light[part])
+                add_scaled(matrix, np.ascontiguousarray(albedo[:, part]), light[part], result, s * n)
         return result
 
     def rows(self, ids: NDArray[np.integer]) -> scipy.sparse.csr_array:

@@ -11,7 +11,7 @@ from conftest import COLOURS, T, build, diffuse, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.core.sparse_product import multiply_scaled, multiply_sparse
+from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled, multiply_sparse
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.interpolated import Interpolated
@@ -185,15 +185,21 @@ def test_product(width):
     assert multiply_sparse(matrix, dense[:, :0]).shape == (300, 0)
 
 
-def test_several_albedos_share_a_light():
-    """Against dense products, in slabs of columns too."""
+def test_several_albedos_share_a_light(monkeypatch):
+    """Against dense products, in slabs of columns too; into some rows of a result, and added to what these had."""
+    monkeypatch.setattr("mi_sparse_prt.core.sparse_product.SLAB", 16)
     rng = np.random.default_rng(0)
     matrix = scipy.sparse.random_array((90, 70), density=0.2, rng=rng, dtype=np.float32).tocsr()
     albedo = rng.random((3, 70), dtype=np.float32)
     for width in (3, 16, 45):
         light = rng.normal(size=(70, width)).astype(np.float32)
         known = np.stack([matrix.toarray() @ (rho[:, None] * light) for rho in albedo])
-        assert np.abs(multiply_scaled(matrix, albedo, light, slab=16) - known).max() < 1e-5
+        assert np.abs(multiply_scaled(matrix, albedo, light) - known).max() < 1e-5
+        sums = np.ones((3, 100, width), np.float32)
+        add_scaled(matrix, albedo, light, sums, 7)
+        assert np.abs(sums[:, 7:97] - 1 - known).max() < 1e-5
+        assert (sums[:, :7] == 1).all()
+        assert (sums[:, 97:] == 1).all()
 
 
 def test_apply_is_the_neumann_series(coloured_scene, monkeypatch):
@@ -401,7 +407,7 @@ def test_nothing_to_gather(why, monkeypatch):
     shapes |= {"ground": {"type": "rectangle", "bsdf": black}} if why == "direct only" else {}
     scene = build(**shapes)
     gather, direct = solver(scene, 4, max_depth=2 if why == "direct only" else 5), visibility(scene)
-    monkeypatch.setattr(bounce_module, "random_combinations", None)  # D is not touched
+    monkeypatch.setattr(bounce_module, "combine_randomly", None)  # D is not touched
     result = gather.indirect(direct)
     assert result.ranks == (0,)
     assert result.bounces == 0
