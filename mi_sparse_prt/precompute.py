@@ -254,8 +254,7 @@ class _Attempts:
             errors.append(found.total)
             if found.total <= target or found.dark:
                 break
-            noise = attempts[-1].radiosity.get("noise_in_matrix", math.inf)
-            if not proposals.after(found, self._run.clock.report()["total"], noise):
+            if not proposals.after(found, self._run.clock.report()["total"]):
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))

@@ -17,7 +17,7 @@ from mi_sparse_prt.core.random_keys import GOLDEN_RATIO, finalise_compiled
 from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cubemap import CubemapLighting
-from mi_sparse_prt.scene.scene import FEW_MESHES
+from mi_sparse_prt.scene.scene import FEW_MESHES, TOGETHER
 from mi_sparse_prt.transport import LightTransport
 
 FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this many are kept
@@ -81,7 +81,7 @@ class Effort:
 
 def _share(n_meshes: int) -> float:
     """Of the least number of elements, where meshes are many: cost follows vertices, not shapes."""
-    return min(1.0, FEW_MESHES / n_meshes)
+    return 1.0 if n_meshes <= FEW_MESHES else TOGETHER / n_meshes
 
 
 @dataclass(frozen=True)

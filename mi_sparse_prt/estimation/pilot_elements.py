@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.darkness import unoccluded_squares
-from mi_sparse_prt.scene.scene import FEW_MESHES
+from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
@@ -58,7 +58,7 @@ class PilotElements:
     seed : int or SeedSequence
         Elements and their random numbers are drawn from it, and differ from those of a matrix of the same seed.
     vertices_per_mesh, texels_per_vertex : int
-        Of many meshes, as many vertices as of ``FEW_MESHES``, drawn from all together.
+        Of many meshes, as many vertices as of ``TOGETHER``, drawn from all together.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class PilotElements:
         stream = random_stream(seed, PILOT)
         self._seeds, rng = element_seeds(stream, 4), np.random.default_rng(stream)
         strata = scene.sampled_together
-        most = vertices_per_mesh * (FEW_MESHES if len(strata) < len(scene.meshes) else 1)
+        most = vertices_per_mesh * (TOGETHER if len(strata) < len(scene.meshes) else 1)
         sizes = [part.stop - part.start for part in strata]
         chosen = [
             part.start + np.sort(rng.choice(size, min(size, most), replace=False))

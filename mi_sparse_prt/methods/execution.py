@@ -172,7 +172,7 @@ class Execution:
             part, noise = glossy_indirect(problem, direct, plan.rays, plan.tolerance, nodes, seed, specular)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays}
-        account = _account(part) | noise
+        account = _account(part) | {"noise_of_rays": noise}
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=account)
 
     def _path_traced(self, plan: Plan, light: MethodResult) -> MethodResult:

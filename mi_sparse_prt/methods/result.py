@@ -34,7 +34,7 @@ class MethodResult:
         Of methods that leave elements out: per mesh, how many vertices and directions were taken.
     radiosity : dict
         Of finite elements: ``ranks`` per channel, ``bounces``, and of glossy scenes ``noise_of_rays`` (relative L2, in
-        the first bounce) and ``noise_in_matrix`` (with what the rank leaves out, beside all light).
+        the first bounce).
     dense : (k,) int64 or None
         Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
     """

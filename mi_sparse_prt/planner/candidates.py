@@ -56,19 +56,17 @@ class RefinementSchedule:
         self.plan, *self._others = plans
         self._limit, self._started, self._error = limit, started, math.inf
 
-    def after(self, found: HeldOutError, elapsed: float, noise: float = math.inf) -> bool:
+    def after(self, found: HeldOutError, elapsed: float) -> bool:
         """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
 
-        More rays and a higher rank make light more exact that is gathered, and no other; by no more than the ``noise``
-        that these left in it, relative to all light, where that is known.
+        More rays make light more exact that is gathered, and no other.
         """
         if not self._others:
             return False
         before, following = self.plan, self._others[0]
         if before.indirect == "gather" and _kind(before) == _kind(following):
             more = following.rays / before.rays
-            gathered = min(found.parts["indirect"], noise)
-            least = math.sqrt(max(found.total**2 - gathered**2 * (1 - 1 / more), 0.0))
+            least = math.sqrt(max(found.total**2 - found.parts["indirect"] ** 2 * (1 - 1 / more), 0.0))
             seconds = elapsed + more * (elapsed - self._started)
             # the most that more rays can do, and what they did last time
             helped = max(least / found.total, found.total / self._error) <= MINIMUM_GAIN
@@ -143,7 +141,7 @@ class CandidatePlans:
         fixed = costs.fixed + costs.direct[direct].seconds
         self._rank(replace(with_direct(costs, direct, costs.direct_share * error), fixed=fixed))
 
-    def after(self, found: HeldOutError, elapsed: float, noise: float = math.inf) -> bool:
+    def after(self, found: HeldOutError, elapsed: float) -> bool:
         """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
 
         Where what would meet the target takes too long, or nothing would, the next one is at least clearly more exact,
@@ -155,8 +153,6 @@ class CandidatePlans:
         found : HeldOutError
         elapsed : float
             Seconds since the beginning: in all, ``max_seconds`` are not to be exceeded.
-        noise : float
-            Of rays, as for ``RefinementSchedule``; here two attempts tell it.
         """
         settings, target, error = self._settings, self._settings.target_error, found.total
         if target is None or len(self._tried) == ATTEMPTS:

@@ -133,6 +133,11 @@ class Material:
         textured = self._radiance is not None and self._radiance.is_spatially_varying()
         self.constant = self._classes <= PLAIN and not textured
 
+    @property
+    def shines(self) -> bool:
+        """Whether the shape is an emitter."""
+        return self._emitter is not None
+
     def back(self) -> Material:
         """What the back of the shape is made of."""
         behind = copy(self)

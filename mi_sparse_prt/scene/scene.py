@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,9 +28,16 @@ from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.traversal import places_of_lamps
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, triangle_keys, unique_rows
+from mi_sparse_prt.scene.triangle_mesh import (
+    TriangleMesh,
+    concatenated,
+    connected_pieces,
+    triangle_keys,
+    unique_rows,
+)
 
 FEW_MESHES = 12  # more are sampled together: what each took would grow with shapes, not with vertices
+TOGETHER = 4  # meshes, as of which samples of these are
 
 
 @dataclass(frozen=True)
@@ -90,8 +97,9 @@ class Scene:
         World space: the meshes of `fronts`, in that order and with these vertices, plus the sensors, emitters
         and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
     normalised : mi.Scene
-        The same meshes and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
-        no sensors.
+        The same surfaces and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
+        no sensors. Of more than a dozen meshes, those of one plain material that follow each other are one shape: every
+        shape that is alive makes kernels slower to trace, a thousand of them by 0.2 s each time.
     centre : (3,) float64
     scale : float
         normalised = (world - centre) * scale, computed in float64. A scene that was scaled gives the same
@@ -117,16 +125,14 @@ class Scene:
         self.centre: NDArray[np.float64] = (low + high) / 2
         self.scale = float(1 / np.max(high - low))
         world = [build_mitsuba_mesh(m, k.bsdf, k.emission()) for m, k in zip(meshes, materials, strict=True)]
-        unit = [
-            build_mitsuba_mesh(m, k.bsdf, positions=self._normalise(m.positions))
-            for m, k in zip(meshes, materials, strict=True)
-        ]
+        self._runs = _alike(materials)
+        unit = [self._traced(concatenated(meshes[run]), materials[run.start]) for run in self._runs]
         # An area emitter may outlive its shape, and Mitsuba then reads freed memory: these are kept. Others are not:
         # each instance that is alive makes every kernel slower to trace
         self._original = [shape for shape in mitsuba.shapes() if shape.is_emitter()]
         names = [mesh.name for mesh in meshes]
         self.mitsuba: mi.Scene = build_mitsuba_scene(world, names, mitsuba)
-        self.normalised: mi.Scene = build_mitsuba_scene(unit, names)
+        self.normalised: mi.Scene = build_mitsuba_scene(unit, [names[run.start] for run in self._runs])
         self._surfaces = meshes
 
         albedo = [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
@@ -151,6 +157,10 @@ class Scene:
         self.positions = fronts[self.front_of]
         self.normals = np.concatenate([m.normals for m in (*meshes, *(back.mesh for back in backs))])
         self.normalised_positions = self._normalise(self.positions)
+
+    def _traced(self, mesh: TriangleMesh, material: Material) -> mi.Mesh:
+        """A mesh of the normalised frame."""
+        return build_mitsuba_mesh(mesh, material.bsdf, positions=self._normalise(mesh.positions))
 
     def _normalise(self, positions: NDArray[np.float32]) -> NDArray[np.float32]:
         return ((positions.astype(np.float64) - self.centre) * self.scale).astype(np.float32)
@@ -219,8 +229,11 @@ class Scene:
 
     @cached_property
     def _shapes_in_world(self) -> ShapeTable:
-        pointers = dr.reinterpret_array(mi.UInt32, self.mitsuba.shapes_dr())
-        return ShapeTable([self.normalised, self.unsplit], np.tile(pointers.numpy(), 2))
+        pointers = dr.reinterpret_array(mi.UInt32, self.mitsuba.shapes_dr()).numpy()
+        of_runs = pointers[
+            [run.start for run in self._runs]
+        ]  # of which none shines, if it is of several shapes
+        return ShapeTable([self.normalised, self.unsplit], np.tile(of_runs, 2))
 
     def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
         """One of the scene's own cameras by its number; a sensor is passed on.
@@ -306,18 +319,11 @@ class Scene:
         """
         if all(mesh.unsplit is None for mesh in self._surfaces):
             return self.normalised
-        shapes = [
-            shape
-            if (whole := mesh.unsplit) is None
-            else build_mitsuba_mesh(whole, material.bsdf, positions=self._normalise(whole.positions))
-            for shape, mesh, material in zip(
-                self.normalised.shapes(),
-                self._surfaces,
-                self.materials,
-                strict=False,  # fronts
-            )
-        ]
-        return build_mitsuba_scene(shapes, [mesh.name for mesh in self._surfaces])
+        shapes = []
+        for run, shape in zip(self._runs, self.normalised.shapes(), strict=True):
+            whole = concatenated(self._surfaces[run]).unsplit
+            shapes.append(shape if whole is None else self._traced(whole, self.materials[run.start]))
+        return build_mitsuba_scene(shapes, [self._surfaces[run.start].name for run in self._runs])
 
     @cached_property
     def specular_surfaces(self) -> mi.Scene | None:
@@ -336,11 +342,12 @@ class Scene:
 
     def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> mi.Scene | None:
         """A scene of some surfaces of ``unsplit``, in the normalised frame; None for none."""
-        which = [k for k, material in enumerate(self.materials[: len(self.fronts)]) if belongs(material)]
+        which = [k for k, run in enumerate(self._runs) if belongs(self.materials[run.start])]
         shapes = self.unsplit.shapes()
         if len(which) in (0, len(shapes)):
             return self.unsplit if which else None
-        return build_mitsuba_scene([shapes[k] for k in which], [self.fronts[k].name for k in which])
+        names = [self.fronts[self._runs[k].start].name for k in which]
+        return build_mitsuba_scene([shapes[k] for k in which], names)
 
     @property
     def passes_straight(self) -> bool:
@@ -398,6 +405,15 @@ class Scene:
     def __repr__(self) -> str:
         names = ", ".join(f"{m.name} {m.vertices.stop - m.vertices.start}" for m in self.meshes)
         return f"Scene({self.n_vertices} vertices: {names})"
+
+
+def _alike(materials: Sequence[Material]) -> list[slice]:
+    """Runs of meshes, of the same plain material each; what shines, or has a texture, is alone, as are few meshes."""
+    if len(materials) <= FEW_MESHES:
+        return [slice(k, k + 1) for k in range(len(materials))]
+    digests = [k.digest() if k.constant and not k.shines else None for k in materials]
+    starts = [k for k, own in enumerate(digests) if k == 0 or own is None or own != digests[k - 1]]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(materials)], strict=True)]
 
 
 def _listed(fronts: list[TriangleMesh], backs: list[Back]) -> tuple[Mesh, ...]:

@@ -67,7 +67,7 @@ def find_backs(
     Parameters
     ----------
     scene : mi.Scene
-        In the normalised frame: one shape for each mesh, which are in world space.
+        In the normalised frame: the same triangles as those of the meshes, in their order.
     meshes : sequence of TriangleMesh
     materials : sequence of Material
     lamps : (n, 3) float32, optional
@@ -177,8 +177,10 @@ class _Looks:
         self._first = first_triangles(scene)
         corners = np.concatenate(
             [
-                np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[mesh.triangles]
-                for shape, mesh in zip(scene.shapes(), meshes, strict=True)
+                np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[
+                    np.array(shape.faces_buffer()).reshape(-1, 3)
+                ]
+                for shape in scene.shapes()
             ]
         ).astype(np.float32)  # [triangle, corner, xyz]
         outwards = np.concatenate([_mean_normals(mesh) for mesh in meshes])

@@ -18,7 +18,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
-from mi_sparse_prt.core.metrics import relative_l2_from_squares, relative_noise
+from mi_sparse_prt.core.metrics import relative_noise
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.threads import run_in_parts
@@ -146,13 +146,11 @@ class GatherRays:
     out: Floats
     per_vertex: int
 
-    def noise(
-        self, direct: FactoredVisibility, albedo: Floats, points: Points, seed: int
-    ) -> tuple[float, float]:
-        """Relative L2 of what their randomness leaves in the first bounce, and how large that is beside all light.
+    def noise(self, direct: FactoredVisibility, albedo: Floats, points: Points, seed: int) -> float:
+        """Relative L2 of what their randomness leaves in the first bounce of unit-albedo light.
 
-        Of unit-albedo light, from how far two halves of them differ, at some vertices and under random sums of
-        columns. ``albedo`` is that of one channel, (n_v,).
+        From how far two halves of them differ, at some vertices and under random sums of columns.
+        ``albedo`` is that of one channel, (n_v,).
         """
         some = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
         row = np.full(len(self.points), -1)
@@ -164,10 +162,7 @@ class GatherRays:
         halves = scipy.sparse.csr_array((albedo[self.seen[own]], place), shape=shape)
         light = np.empty((len(points), min(BITS, direct.shape[1])), np.float32)
         combine_randomly(direct.visibility, USUAL.mixed, np.random.default_rng(seed), light)
-        first, second = np.split(halves @ light / np.float32(self.per_vertex), 2)
-        whole = first + second + light[self.points[some]]
-        share = relative_l2_from_squares(np.square(first + second).sum(), np.square(whole).sum())
-        return relative_noise(first, second), float(share)
+        return relative_noise(*np.split(halves @ light, 2))
 
 
 def gather_rays(
@@ -295,8 +290,8 @@ def glossy_indirect(
     nodes: Nodes,
     seed: int,
     specular: SparseRows | ByDepth | None = None,
-) -> tuple[Gathered | GatheredByDepth, dict[str, float]]:
-    """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays (``MethodResult``).
+) -> tuple[Gathered | GatheredByDepth, float]:
+    """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
     Parameters
     ----------
@@ -318,7 +313,7 @@ def glossy_indirect(
     ones = np.ones(direct.shape[0] - len(albedo), np.float32)
     points = np.union1d(nodes.ids, direct.glossy)
     rays = gather_rays(problem, outgoing, rays_per_vertex, seed, points)
-    noise, share = rays.noise(direct, albedo.mean(axis=1), problem.points, seed)
+    noise = rays.noise(direct, albedo.mean(axis=1), problem.points, seed)
     rows = nodes_and_terms(nodes, direct)
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
     found = []
@@ -327,8 +322,7 @@ def glossy_indirect(
         solver = GlossyGather(matrices, np.concatenate([shade, ones]), problem, direct, rows, seed)
         own = None if specular is None else _channel(specular, channel)
         found.append(solver.indirect(direct, max(tolerance, min(noise, MOST_NOISE)), own))
-    part = _joined(found)
-    return part, {"noise_of_rays": noise, "noise_in_matrix": share * float(np.hypot(noise, part.left_out))}
+    return _joined(found), noise
 
 
 def _channel(specular: SparseRows | ByDepth, number: int) -> Operator:

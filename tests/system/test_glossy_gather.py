@@ -274,9 +274,6 @@ def test_noise_of_rays_is_known() -> None:
     pairs = [np.linalg.norm(a - b) / np.sqrt(2) for k, a in enumerate(found) for b in found[:k]]
     known = np.mean([t.report["radiosity"]["noise_of_rays"] for t in few])
     assert 0.5 * known < np.mean(pairs) / np.linalg.norm(exact) < 1.33 * known
-    among_all = np.mean([t.report["radiosity"]["noise_in_matrix"] for t in few])
-    whole = np.linalg.norm(exact + few[0].direct.rows(np.arange(n))[..., 0])
-    assert 0.5 * among_all < np.mean(pairs) / whole < 1.33 * among_all
     many = bounce(128, 0)
     assert many.report["radiosity"]["noise_of_rays"] < known / 2
     assert max(few[0].report["radiosity"]["ranks"]) < max(many.report["radiosity"]["ranks"])

@@ -631,8 +631,6 @@ def test_plans_in_turn_end_where_rays_do_not_help():
     turns = RefinementSchedule(plans, limit=100.0, started=2.0)
     assert turns.after(found(0.01, 0.1), 4.0) and turns.plan == plans[1]
     assert not RefinementSchedule(plans).after(found(0.1, 0.03), 4.0)
-    assert not RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, noise=0.04)  # the rest is no noise
-    assert RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, noise=0.09)
     assert not turns.after(found(0.01, 0.095), 10.0) and turns.plan == plans[1]
     assert turns.after(found(0.01, 0.06), 10.0) and turns.plan == plans[2]
     assert not turns.after(found(0.01, 0.03), 40.0)  # 4 x 30 s more
