@@ -27,6 +27,7 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import combine_randomly
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
@@ -41,7 +42,6 @@ from mi_sparse_prt.solvers.radiosity import (
     FiniteElements,
     Gathered,
     GatheredByDepth,
-    joined_channels,
 )
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
@@ -336,7 +336,11 @@ def _joined(found: list[Gathered | GatheredByDepth]) -> Gathered | GatheredByDep
     """Light of several channels, each of which was found on its own."""
     by_depth = [f for f in found if isinstance(f, GatheredByDepth)]
     if by_depth:
-        return joined_channels(by_depth)
+        terms = (
+            LowRank(tuple(t.left[0] for t in some), tuple(t.right[0] for t in some))
+            for some in zip(*(f.terms for f in by_depth), strict=True)
+        )
+        return GatheredByDepth(tuple(terms), max(f.left_out for f in by_depth))
     summed = [f for f in found if isinstance(f, Gathered)]
     return Gathered(
         tuple(f.left[0] for f in summed),

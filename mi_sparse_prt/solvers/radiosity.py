@@ -505,15 +505,6 @@ def _energies(x: Floats) -> NDArray[np.float64]:
     return np.square(x).sum(axis=0, dtype=np.float64)
 
 
-def joined_channels(found: Sequence[GatheredByDepth]) -> GatheredByDepth:
-    """Light of several channels, each of which was found on its own."""
-    terms = (
-        LowRank(tuple(t.left[0] for t in some), tuple(t.right[0] for t in some))
-        for some in zip(*(f.terms for f in found), strict=True)
-    )
-    return GatheredByDepth(tuple(terms), max(f.left_out for f in found))
-
-
 def form_factors(
     problem: Problem, rays: int, seed: int, ids: NDArray[np.integer]
 ) -> list[scipy.sparse.csr_array]:

@@ -58,11 +58,9 @@ class ReferenceMatrix:
         if camera is None:
             rays = rays or vertex_rays(scene.normalised if distant else scene.mitsuba, scene)
         if distant:
-            shapes = scene.unlit_shapes()
-            if rays is not None:
-                paint = diffuse_patches(scene, rays, rows)
-                shapes = [*scene.normalised.shapes(), *([] if paint is None else [paint])]
-            self._sky = self._under_a_sky(shapes)
+            self._sky = self._under_a_sky(
+                scene.unlit_shapes() if rays is None else _painted(scene, rays, rows)
+            )
             self._parameters = mi.traverse(self._sky)
         if rays is not None:
             lit = self._sky if distant else scene.mitsuba
@@ -121,3 +119,9 @@ class ReferenceMatrix:
             return np.array(image)[..., :3].reshape(-1, 3)[self._rows]
 
         return seen(self._path) - (seen(self._only_lights) if self._sees_lights else np.float32(0))
+
+
+def _painted(scene: Scene, rays: VertexRays, rows: NDArray[np.integer]) -> list[mi.Mesh]:
+    """The surfaces of the normalised frame, and specks of paint on rows that are not diffuse."""
+    paint = diffuse_patches(scene, rays, rows)
+    return [*scene.normalised.shapes(), *([] if paint is None else [paint])]

@@ -203,11 +203,9 @@ def _left_out(scene: Scene, transport: LightTransport) -> list[str]:
     if transport.emission.kind == "cubemap" or transport.measurement.kind != "vertices":
         return []
     names = [k.name for k in scene.materials[: len(scene.fronts)] if not k.diffuse]
-    return (
-        [f"rows of surfaces that are not diffuse, of which lamps are reflected: {', '.join(names)}"]
-        if names
-        else []
-    )
+    if not names:
+        return []
+    return [f"rows of surfaces that are not diffuse: of lamps they are not compared: {', '.join(names)}"]
 
 
 def _chosen_rows(

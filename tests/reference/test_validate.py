@@ -240,6 +240,28 @@ def test_rows_of_surfaces_that_are_not_diffuse():
     assert report["relative_l2"]["meshes"]["mirror"] == 0
 
 
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_paint_has_the_reflectance_of_its_row():
+    """Expected: under even light the rows of flat surfaces that see nothing else sum up to their reflectance, within
+    four standard errors, of which each is 0.5% at most; a mirror's are 0.
+    """
+    flat = T().rotate([1, 0, 0], -90)
+    shapes = {
+        name: {"type": "rectangle", "to_world": T().translate([3 * k, 0, 0]) @ flat, "bsdf": bsdf}
+        for k, (name, bsdf) in enumerate((("metal", METAL), ("lacquer", LACQUER), ("mirror", MIRROR)))
+    }
+    scene = build(1.0, **shapes)
+    rows = np.concatenate([np.arange(mesh.vertices.start, mesh.vertices.stop)[:8] for mesh in scene.meshes])
+    reference = ReferenceMatrix(scene, prt.CubemapLighting(1), "texel", 2, rows)
+    sums = np.stack([reference.columns(np.arange(6), 1024, seed).sum(axis=1) for seed in range(8)])
+    for k in range(2):
+        own, known = sums[:, 8 * k : 8 * k + 8].mean(axis=1), scene.albedo[rows[8 * k]]
+        error = own.std(axis=0, ddof=1) / np.sqrt(len(own))
+        assert (np.abs(own.mean(axis=0) - known) < 4 * error).all()
+        assert (error < 0.005 * known).all()
+    assert not sums[:, 16:].any()
+
+
 @pytest.mark.usefixtures("no_held_out")
 def test_rows_in_another_order(scene):
     """A matrix is validated against a scene whose shapes come the other way round."""

@@ -13,10 +13,12 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled, multiply_sparse
 from mi_sparse_prt.measurement.vertices import vertex_points
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks
 from mi_sparse_prt.operators.interpolated import Interpolated
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import first_bounce as bounce_module
@@ -25,7 +27,8 @@ from mi_sparse_prt.solvers import radiosity as gather_module
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import RandomBasis
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.radiosity import LowRankOptions, RadiositySolver
+from mi_sparse_prt.solvers.radiosity import FiniteElements, LowRankOptions, RadiositySolver
+from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 WHITE = diffuse(1, 1, 1)
 ROOM = {"type": "cube", "flip_normals": True}
@@ -415,3 +418,34 @@ def test_nothing_to_gather(why, monkeypatch):
     assert not result.columns(np.array([0, 5])).any()
     assert not result.relight(np.ones((96, 3), np.float32)).any()
     assert not gather.apply(np.ones((scene.n_vertices, 2), np.float32)).any()
+
+
+def test_coloured_light_is_told_apart_by_depth():
+    """
+    Rationale: all channels of light that came by way of coloured glass share a random basis.
+
+    Expected: each channel and each depth is X_s = sum over k < s of G_k rho (E_(s-1-k) + X_(s-1-k)), as dense products
+        have it.
+    """
+    n, m, count, rng = 120, 96, 3, np.random.default_rng(5)
+
+    def sparse(columns: int, density: float) -> scipy.sparse.csr_array:
+        return scipy.sparse.random_array((n, columns), density=density, rng=rng, dtype=np.float32).tocsr()
+
+    matrices = [sparse(n, 0.1) * np.float32(0.1 / (1 + k)) for k in range(count)]
+    albedo = rng.random((3, n), dtype=np.float32)
+    direct = SparseRows((sparse(m, 0.5),))
+    specular = ByDepth(tuple(SparseRows(tuple(sparse(m, 0.1) for _ in range(3))) for _ in range(count)))
+    keys = rng.integers(1 << 63, size=n).astype(np.uint64)
+    elements = FiniteElements(matrices, albedo, keys, Nodes(np.arange(n), None), 2 + count, 1)
+    found = elements.indirect(direct, 1e-3, specular)
+    assert len(found.terms) == count
+    for c in range(3):
+        light = [direct.matrices[0].toarray(), *(term.matrices[c].toarray() for term in specular.terms)]
+        known = [np.zeros((n, m))]
+        for s in range(1, count + 1):
+            sent = [albedo[c][:, None] * (light[t] + known[t]) for t in range(s)]
+            known.append(sum(matrices[k] @ sent[s - 1 - k] for k in range(s)))
+        for term, wanted in zip(found.terms, known[1:], strict=True):
+            off = term.left[c] @ term.right[c] - wanted
+            assert np.linalg.norm(off) < 3e-3 * np.linalg.norm(wanted)
