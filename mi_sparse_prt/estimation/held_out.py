@@ -167,8 +167,10 @@ def _joined(records: list[Record]) -> Record:
 
 def estimate_errors(samples: Samples) -> HeldOutError:
     """Relative L2 errors and standard errors."""
-    names = dict.fromkeys(name for name, _ in samples)
-    meshes = {name: _relative_of({k: s for k, s in samples.items() if k[0] == name}) for name in names}
+    of_meshes: dict[str, Samples] = {}
+    for key, sample in samples.items():
+        of_meshes.setdefault(key[0], {})[key] = sample
+    meshes = {name: _relative_of(some) for name, some in of_meshes.items()}
     total = _relative_of(samples)
     rows = max(sample.squares.shape[1] for sample in samples.values())
     glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
@@ -286,13 +288,14 @@ class _Estimator:
     def _batches(self, chosen: dict[tuple[str, str], Chosen]) -> Iterator[list[tuple[str, str]]]:
         """Those to evaluate together: of one part, with as many rows per point, and not too many."""
         begun: dict[tuple[str, int], list[tuple[str, str]]] = {}
+        sizes: dict[tuple[str, int], int] = {}
         for key, some in chosen.items():
-            kind = key[1], self._rows_per_point(some)
-            batch = begun.setdefault(kind, [])
-            if batch and sum(len(chosen[k].weights) for k in [*batch, key]) > BATCH:
+            kind, size = (key[1], self._rows_per_point(some)), len(some.weights)
+            if kind in begun and sizes[kind] + size > BATCH:
                 yield begun.pop(kind)
-                batch = begun.setdefault(kind, [])
-            batch.append(key)
+                sizes[kind] = 0
+            begun.setdefault(kind, []).append(key)
+            sizes[kind] = sizes.get(kind, 0) + size
         yield from begun.values()
 
     def direct(self, chosen: Chosen) -> Sample:

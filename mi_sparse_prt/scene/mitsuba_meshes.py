@@ -102,21 +102,25 @@ def lit_scene(shapes: Sequence[mi.Shape], light: mi.Emitter | dict[str, Any], **
     return mi.load_dict({**watertight_scene(), "light": light, **others, **named})
 
 
+def objects_off_shapes(scene: mi.Scene) -> list[mi.Object]:
+    """Its sensors, emitters and integrator that belong to no shape."""
+    on_shapes = [s.emitter() for s in scene.shapes() if s.is_emitter()]
+    on_shapes += [s.sensor() for s in scene.shapes() if s.is_sensor()]
+    things = [*scene.sensors(), *scene.emitters(), scene.integrator()]
+    return [thing for thing in things if thing is not None and not any(thing is s for s in on_shapes)]
+
+
 def build_mitsuba_scene(
-    shapes: list[mi.Mesh], names: list[str], original: mi.Scene | None = None
+    shapes: list[mi.Mesh], names: list[str], others: Sequence[mi.Object] = ()
 ) -> mi.Scene:
-    """A Mitsuba scene of these meshes, in order, with the original's sensors, emitters and integrator."""
+    """A Mitsuba scene of these meshes, in order, and of other objects, which keep their ids where these are free."""
     content = dict(zip(names, shapes, strict=True))
-    others: dict[str, mi.Object] = {}
-    if original is not None:
-        on_shapes = [s.emitter() for s in original.shapes() if s.is_emitter()]
-        on_shapes += [s.sensor() for s in original.shapes() if s.is_sensor()]
-        things = [*original.sensors(), *original.emitters(), original.integrator()]
-        for k, thing in enumerate(t for t in things if t is not None and not any(t is s for s in on_shapes)):
-            key = thing.id()
-            free = key and "." not in key and key not in ("type", *content, *others)
-            others[key if free else f"_other_{k}"] = thing
-    return scene_of(others, content)
+    named: dict[str, mi.Object] = {}
+    for k, thing in enumerate(others):
+        key = thing.id()
+        free = key and "." not in key and key not in ("type", *content, *named)
+        named[key if free else f"_other_{k}"] = thing
+    return scene_of(named, content)
 
 
 def scene_of(kept: dict[str, mi.Object], others: dict[str, Any] | None = None) -> mi.Scene:

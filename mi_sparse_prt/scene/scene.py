@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.scene.materials import Material
-from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene
+from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene, objects_off_shapes
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
@@ -124,22 +124,21 @@ class Scene:
         low, high = (f(fronts, axis=0).astype(np.float64) for f in (np.min, np.max))
         self.centre: NDArray[np.float64] = (low + high) / 2
         self.scale = float(1 / np.max(high - low))
-        world = [build_mitsuba_mesh(m, k.bsdf, k.emission()) for m, k in zip(meshes, materials, strict=True)]
-        self._runs = _alike(materials)
-        unit = [self._traced(concatenated(meshes[run]), materials[run.start]) for run in self._runs]
         # An area emitter may outlive its shape, and Mitsuba then reads freed memory: these are kept. Others are not:
         # each instance that is alive makes every kernel slower to trace
         self._original = [shape for shape in mitsuba.shapes() if shape.is_emitter()]
-        names = [mesh.name for mesh in meshes]
-        self.mitsuba: mi.Scene = build_mitsuba_scene(world, names, mitsuba)
-        self.normalised: mi.Scene = build_mitsuba_scene(unit, [names[run.start] for run in self._runs])
-        self._surfaces = meshes
+        self._others, self._emission = objects_off_shapes(mitsuba), [k.emission() for k in materials]
+        self._surfaces, self._runs = meshes, _alike(materials)
+        unit = [self._traced(concatenated(meshes[run]), materials[run.start]) for run in self._runs]
+        self.normalised: mi.Scene = build_mitsuba_scene(unit, [meshes[run.start].name for run in self._runs])
 
-        albedo = [k.albedo(shape, m) for shape, m, k in zip(world, meshes, materials, strict=True)]
+        albedo = [k.albedo(build_mitsuba_mesh(m, k.bsdf), m) for m, k in zip(meshes, materials, strict=True)]
         lamps = self._normalise(places_of_lamps(mitsuba))
         backs, self.dark_backs = find_backs(self.normalised, meshes, materials, lamps)
         behind = {back.shape: materials[back.shape].back() for back in backs}
-        reflected = {k: own.albedo(world[k], meshes[k]) for k, own in behind.items()}
+        reflected = {
+            k: own.albedo(build_mitsuba_mesh(meshes[k], own.bsdf), meshes[k]) for k, own in behind.items()
+        }
         backs = [back for back in backs if reflected[back.shape].any()]
         self.albedo = np.concatenate([*albedo, *(reflected[back.shape][back.vertices] for back in backs)])
         self.materials = [*materials, *(behind[back.shape] for back in backs)]
@@ -206,6 +205,19 @@ class Scene:
     def warnings(self) -> list[str]:
         """What was handled on the user's behalf."""
         return [str(note) for note in self.notes]
+
+    @cached_property
+    def mitsuba(self) -> mi.Scene:
+        """World space: what the user's scene shows, by its own lamps and cameras.
+
+        Built when it is first asked for: an environment's matrix is computed without, and a thousand shapes that are
+        alive make every kernel slower to trace.
+        """
+        shapes = [
+            build_mitsuba_mesh(mesh, material.bsdf, emitter)
+            for mesh, material, emitter in zip(self._surfaces, self.materials, self._emission, strict=False)
+        ]
+        return build_mitsuba_scene(shapes, [mesh.name for mesh in self._surfaces], self._others)
 
     def unlit_shapes(self) -> list[mi.Mesh]:
         """The world-space meshes without their area emitters, for scenes with other light."""
@@ -283,13 +295,11 @@ class Scene:
     @cached_property
     def pieces(self) -> NDArray[np.int64]:
         """(n_v,) number of the connected piece of each vertex; both sides of a surface are pieces of their own."""
-        label, count = np.empty(self.n_vertices, np.int64), 0
-        for mesh in self.meshes:
-            first, same = unique_rows(self.positions[mesh.vertices])
-            own, of_place = connected_pieces(same[mesh.triangles], len(first))
-            label[mesh.vertices] = count + of_place[same]
-            count += own
-        return label
+        sizes = [mesh.vertices.stop - mesh.vertices.start for mesh in self.meshes]
+        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in self.meshes])
+        places = np.column_stack([np.repeat(np.arange(len(sizes)), sizes), self.positions.astype(np.float64)])
+        first, same = unique_rows(places)
+        return connected_pieces(same[triangles], len(first))[1][same].astype(np.int64)
 
     @property
     def diffuse(self) -> bool:

@@ -96,13 +96,14 @@ def read_surfaces(
         edge_length = _diagonal(placed, clean) / 64
 
     surfaces: list[tuple[TriangleMesh, Material]] = []
+    limit = most_vertices
     for where, mesh, material in zip(placed, clean, materials, strict=True):
-        limit = most_vertices - sum(len(other.positions) for other, _ in surfaces)
         if mesh is None:
             mesh = where.in_world(_tessellate(where, material, edge_length, limit), limit)
         _note_if_inwards(mesh, material, notes)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
+        limit -= len(mesh.positions)
         surfaces.append((mesh, material))
     return merge_groups(placed, surfaces), notes
 
