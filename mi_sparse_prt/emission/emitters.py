@@ -175,7 +175,7 @@ class SceneEmitters:
 
     def sample(
         self, element: mi.UInt32, position: mi.Point3f, uv: mi.Point2f
-    ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+    ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float, mi.Float]:
         """One direction in which light of an element arrives, see ``EmissionSpace.sample``."""
         count = dr.gather(mi.UInt32, self._count, element)
         u = uv.x * mi.Float(count)
@@ -185,7 +185,8 @@ class SceneEmitters:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
         si.p = position
         found, weight = emitter.sample_direction(si, mi.Point2f(u - mi.Float(which), uv.y), mi.Mask(True))
-        return found.d, mi.Color3f(weight) * mi.Float(count), found.dist
+        density = dr.select(found.delta, 0, found.pdf / mi.Float(count))
+        return found.d, mi.Color3f(weight) * mi.Float(count), found.dist, density
 
     def element_of(
         self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
@@ -197,6 +198,16 @@ class SceneEmitters:
         known &= (number >= 0) & (number < len(self._group_of))
         group = dr.select(known, dr.gather(mi.Int32, self._group_of, mi.UInt32(number), known), -1)
         return group, dr.select(known, mi.Color3f(emitter.eval(si, known)), 0)
+
+    def density(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
+        """Of a ray's direction among samples, see ``SampledEmission.density``."""
+        emitter, (group, _) = si.emitter(self._scene, active), self.element_of(si, ray, active)
+        start = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.o))
+        start.p = ray.o
+        known = active & (group >= 0)
+        count = dr.gather(mi.UInt32, self._count, mi.UInt32(group), known)
+        found = emitter.pdf_direction(start, mi.DirectionSample3f(self._scene, si, start), known)
+        return dr.select(known, found / mi.Float(dr.maximum(count, 1)), 0)
 
     def attributes(self) -> dict[str, Any]:
         return {"groups": self.groups}

@@ -76,7 +76,7 @@ class SampledEmission(EmissionSpace, Protocol):
     def unmet(self) -> NDArray[np.int64]:
         """Elements (k,) that have light of points or of single directions, which no ray can meet; ascending."""
 
-    def sample(self, element: Any, position: Any, uv: Any, /) -> tuple[Any, Any, Any]:
+    def sample(self, element: Any, position: Any, uv: Any, /) -> tuple[Any, Any, Any, Any]:
         """One direction in which light of an element arrives, on the device.
 
         Parameters
@@ -95,6 +95,8 @@ class SampledEmission(EmissionSpace, Protocol):
             At right angles to it, over the density of the sample.
         distance : Float, world units
             To the light.
+        density : Float
+            Of the sample, per solid angle; 0 where no ray can meet the light.
         """
 
     def element_of(self, si: Any, ray: Any, active: Any, /) -> tuple[Any, Any]:
@@ -113,4 +115,19 @@ class SampledEmission(EmissionSpace, Protocol):
             -1 where it is no light of this space.
         Color3f
             Its radiance along the ray, if the element has the coefficient 1.
+        """
+
+    def density(self, si: Any, ray: Any, active: Any, /) -> Any:
+        """The density per solid angle with which ``sample`` finds, from where rays begin, the light that they meet.
+
+        Parameters
+        ----------
+        si : SurfaceInteraction3f
+            What rays meet: light of an element.
+        ray : Ray3f, world
+        active : Mask
+
+        Returns
+        -------
+        Float
         """

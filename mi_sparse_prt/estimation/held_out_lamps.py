@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
-from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
+from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
@@ -52,7 +52,7 @@ def _true(problem: Problem, asked: tuple[Any, Any], rays: int, paths: int) -> ND
     """Unit-albedo light (m, 3) at listed elements, by the seeds of both."""
     found = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
     if problem.max_depth != 2:
-        found += LampPaths(problem, SPP, paths).elements(*asked).mean
+        found += light_by_paths(problem, *asked, SPP, paths)[0]
         found += _by_mirrors(problem, asked, rays)
     return found
 

@@ -12,7 +12,7 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.operator import Floats
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.lamps import LampPaths, LampRays
+from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
@@ -53,20 +53,15 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
 
 
 def path_traced_lamps(problem: Problem, run: Run, spp: int = SPP, strata: int = 16) -> MethodResult:
-    """By path tracing: any BSDF."""
+    """By path tracing: any BSDF; ``spp`` paths of an element at least."""
     direct, arriving = _direct(problem, run, strata)
-    indirect = None
+    (n, m, _), indirect, traced = direct.shape, None, 0
     if problem.max_depth != 2:
-        with run.clock.phase("indirect"):
-            solver, m = LampPaths(problem, spp, run.seed), problem.emission.size
-            indirect = np.zeros_like(direct)
-            size = max(1, solver.block_elements // m)
-            for ids in _blocks(len(direct), size, "indirect", run):
-                found = solver.elements(np.repeat(ids, m), np.tile(np.arange(m), len(ids)))
-                indirect[ids] = found.mean.reshape(len(ids), m, 3)
-    elements = direct[..., 0].size
-    rays = {"direct": elements * strata**2, "specular": arriving}
-    rays["indirect_paths"] = 0 if indirect is None else elements * spp
+        with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
+            asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
+            indirect, traced = light_by_paths(problem, *asked, spp, run.seed, bar.update)
+            indirect = indirect.reshape(direct.shape)
+    rays = {"direct": n * m * strata**2, "specular": arriving, "indirect_paths": traced}
     return _result(problem, direct, indirect, rays)
 
 

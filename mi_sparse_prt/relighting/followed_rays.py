@@ -107,10 +107,13 @@ def follow(
         sample, weight = _scattered(si, whole, sampler, active)
         valid |= active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         density = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, sample.pdf)
-        throughput *= weight
+        # roulette: faint light is worth few rays; that it is denser in glass (eta) does not matter
+        denser = dr.select(sample.eta > 0, dr.square(sample.eta), 1)
+        goes_on = dr.sqrt(dr.minimum(dr.max(weight) * denser, 1))
+        active &= (depth + 1 < limit) & (sampler.next_1d(active) < goes_on)
+        throughput *= weight / goes_on
         ray = si.spawn_ray(si.to_world(sample.wo))
         depth += 1
-        active &= (depth < limit) & (dr.max(throughput) > 0)
     return total, valid
 
 
@@ -177,7 +180,7 @@ def reflected_lamps(
     """
     chosen = mi.UInt32(sampler.next_1d(active) * lamps.size)
     element = dr.minimum(chosen, dr.opaque(mi.UInt32, lamps.size - 1))
-    towards, irradiance, distance = lamps.sample(element, si.p, mi.Point2f(sampler.next_2d(active)))
+    towards, irradiance, distance, _ = lamps.sample(element, si.p, mi.Point2f(sampler.next_2d(active)))
     ray = si.spawn_ray(towards)
     met = scene.ray_intersect(ray, active)
     found, _ = lamps.element_of(met, ray, active)

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.core.random_keys import element_seeds, random_generator, random_stream
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, has_mirrors, trace_reflected
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
+SHARED_OUT = 9  # spawn key
+PILOT = 4  # for so many paths, one more tells how many an element needs
+MOST = 256  # times as many paths as others may an element have
 
 Floats = NDArray[np.float32]
 
@@ -84,7 +91,7 @@ class LampRays:
             (mi.Float(row) + rng.next_float32()) / self._strata,
         )
         position = self._scene.to_world(self._points.position(point))
-        direction, irradiance, distance = self._emission.sample(lamp, position, uv)
+        direction, irradiance, distance, _ = self._emission.sample(lamp, position, uv)
         cosine = dr.dot(self._points.normal(point), direction)
         lit = (cosine > 0) & (dr.max(irradiance) > 0)
         lamp_at = self._points.position(point) + direction * (distance * self._scene.scale)
@@ -126,29 +133,96 @@ class LampPaths(PathSolver):
     def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
 
-        def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+        def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[Any, Any, Any, Any]:
             uv = mi.Point2f(rng.next_float32(), rng.next_float32())
-            direction, irradiance, distance = self._emission.sample(texel, self._world.to_world(si.p), uv)
-            return direction, irradiance, distance * self._world.scale
+            direction, irradiance, distance, density = self._emission.sample(
+                texel, self._world.to_world(si.p), uv
+            )
+            return direction, irradiance, distance * self._world.scale, density
 
-        def met(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Color3f:
-            lamp, radiance = lamp_met(self.problem, si, ray, active)
-            return dr.select(active & (lamp == mi.Int32(texel)), radiance, 0)
+        def met(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> tuple[mi.Color3f, mi.Float]:
+            there, from_world = in_world(self._world, si, ray, active)
+            lamp, radiance = self._emission.element_of(there, from_world, active)
+            found = active & (lamp == mi.Int32(texel))
+            return dr.select(found, radiance, 0), self._emission.density(there, from_world, found)
 
         light = Light(sample, scattered=True, rough_glass=self._world.rough_glass)
-        if has_mirrors(self.scene):
+        if has_mirrors(self.scene) or len(self._emission.unmet) < self._emission.size:
             light.met = met
         return trace_reflected(self.scene, ray, light, rng, bounces)
+
+
+def light_by_paths(
+    problem: Problem,
+    point_ids: NDArray[np.integer],
+    columns: NDArray[np.integer],
+    spp: int,
+    seed: int,
+    ticks: Callable[[int], None] = lambda _: None,
+) -> tuple[Floats, int]:
+    """Indirect light (m, 3) of listed elements by some paths of each, more where these spread, and how many these were.
+
+    A few paths more tell how far those of an element spread, and half as many as all are shared out in proportion to
+    that (Neyman 1934): near a lamp, a few elements have most of the noise. What is found does not depend on the first.
+
+    Parameters
+    ----------
+    problem : Problem
+        With lamps.
+    point_ids, columns : (m,) integers
+    spp : int
+        Paths of an element, at least.
+    seed : int
+    ticks : callable, optional
+        Is told of elements that are done.
+    """
+    m, result = len(point_ids), np.zeros((len(point_ids), 3), np.float32)
+    counts, traced = np.full(m, spp), 0
+    pilot, main = element_seeds(random_stream(seed, SHARED_OUT), 2)
+    if spp >= PILOT**2:
+        first = LampPaths(problem, spp // PILOT, pilot)
+        power = np.square(problem.reflection.albedo[point_ids].astype(np.float64))
+        variance = first.elements(point_ids, columns).variance
+        counts = shared_out(first.spp * (power * variance).sum(axis=1), first.spp, spp)
+        traced = m * first.spp
+    for count in np.unique(counts):
+        those, paths = np.flatnonzero(counts == count), LampPaths(problem, int(count), main)
+        for a in range(0, len(those), paths.block_elements):
+            some = those[a : a + paths.block_elements]
+            result[some] = paths.elements(point_ids[some], columns[some]).mean
+            ticks(len(some))
+    return result, traced + int(counts.sum())
+
+
+def shared_out(squares: NDArray[np.float64], seen: int, least: int) -> NDArray[np.int64]:
+    """How many paths each element gets: the least by powers of two, half as many more in all, about.
+
+    Parameters
+    ----------
+    squares : (m,) float64
+        Variance of an element's paths, as ``seen`` of them show it. It is taken as if one more had been seen, of an
+        average element: light that is found seldom is not found by few.
+    seen, least : int
+    """
+    spread = np.sqrt((seen * squares + squares.mean()) / (seen + 1))
+    share = spread / max(spread.mean(), 1e-300) / 2
+    return least * 2 ** np.rint(np.log2(1 + np.minimum(share, MOST))).astype(np.int64)
 
 
 def lamp_met(
     problem: Problem, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
 ) -> tuple[mi.Int32, mi.Color3f]:
     """The lamp at what rays meet (both of the normalised frame), -1 for none, and its radiance."""
-    scene = problem.scene
+    return problem.emission.element_of(*in_world(problem.scene, si, ray, active), active)
+
+
+def in_world(
+    scene: Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f]:
+    """What rays of the normalised frame meet, and these rays, in world space."""
     there = mi.SurfaceInteraction3f(si)
     there.p, there.shape = scene.to_world(si.p), scene.shape_in_world(si.shape, active & si.is_valid())
-    return problem.emission.element_of(there, mi.Ray3f(scene.to_world(ray.o), ray.d), active)
+    return there, mi.Ray3f(scene.to_world(ray.o), ray.d)
 
 
 def lamp_asked(
@@ -165,7 +239,7 @@ def lamp_asked(
     place = dr.minimum(mi.UInt32(rng.next_float32() * mi.Float(count)), count - 1)
     lamp = dr.gather(mi.UInt32, unmet, place, active)
     uv = mi.Point2f(rng.next_float32(), rng.next_float32())
-    towards, irradiance, distance = lamps.sample(lamp, scene.to_world(si.p), uv)
+    towards, irradiance, distance, _ = lamps.sample(lamp, scene.to_world(si.p), uv)
     lit = active & ~scene.unsplit.ray_test(si.spawn_ray_to(si.p + towards * (distance * scene.scale)), active)
     ray = si.spawn_ray(towards)
     met, _ = lamp_met(problem, scene.unsplit.ray_intersect(ray, lit), ray, lit)

@@ -120,9 +120,10 @@ class PathSolver:
 
     def _estimate(self, points: mi.UInt32, texels: mi.UInt32, seed: int) -> Estimate:
         lane = dr.arange(mi.UInt32, len(points) * self.spp)
-        element = lane // self.spp
+        spp = dr.opaque(mi.UInt32, self.spp)  # one kernel for all numbers
+        element = lane // spp
         point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
-        rng = random_generator(self._points.key(point), texel, lane - element * self.spp, seed)
+        rng = random_generator(self._points.key(point), texel, lane - element * spp, seed)
         ray = self._first_ray(point, rng)
         samples = self._weighted(point, ray.d, self._radiance(ray, texel, rng))
         powers = [x * x for x in samples]
@@ -190,7 +191,8 @@ class Light:
     ----------
     sample : callable
         Of an interaction (its ``p`` in the frame of the scene) and the random numbers of a path: a direction, the
-        irradiance at right angles to it, and how far the light is, None if it is not near.
+        irradiance at right angles to it, how far the light is, None if it is not near, and the density of the sample
+        per solid angle, 0 if no ray can meet it.
     contains : callable, optional
         A shadow ray cannot find a light through a mirror. Where there are mirrors and the light has an extent, paths
         that leave the scene right after one collect ``radiance`` if they leave towards the light.
@@ -200,20 +202,21 @@ class Light:
     rough_glass : sequence of mi.BSDF
         These are glass as well, then.
     met : callable, optional
-        Of lamps, in place of ``contains``: the radiance that rays meet right after a mirror.
+        Of lamps, in place of ``contains``: the radiance that rays meet, and the density with which ``sample`` finds it.
+        Both estimates count, by the balance heuristic of multiple importance sampling.
     """
 
-    sample: Callable[[Any, Any], tuple[Any, Any, Any]]
+    sample: Callable[[Any, Any], tuple[Any, Any, Any, Any]]
     contains: Callable[[mi.Vector3f], mi.Mask] | None = None
     radiance: mi.Float | None = None
     scattered: bool = False
     rough_glass: Sequence[mi.BSDF] = ()
-    met: Callable[[mi.SurfaceInteraction3f, mi.Ray3f, mi.Mask], mi.Color3f] | None = None
+    met: Callable[[mi.SurfaceInteraction3f, mi.Ray3f, mi.Mask], tuple[mi.Color3f, mi.Float]] | None = None
 
 
-def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
+def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any, Any]]:
     """The same direction everywhere."""
-    return lambda si, rng: (direction, irradiance, None)
+    return lambda si, rng: (direction, irradiance, None, mi.Float(0))
 
 
 def has_mirrors(scene: mi.Scene) -> bool:
@@ -233,7 +236,7 @@ def trace_reflected(
     ray = mi.Ray3f(ray)
     result, throughput = mi.Color3f(0), mi.Color3f(1)
     depth = mi.UInt32(0)
-    mirrored, counts = mi.Mask(False), mi.Mask(not light.scattered)
+    mirrored, counts, density = mi.Mask(False), mi.Mask(not light.scattered), mi.Float(0)
     active = mi.Mask(depth < bounces)
     while active:
         si = scene.ray_intersect(ray, active)
@@ -241,14 +244,16 @@ def trace_reflected(
             escaped = active & mirrored & counts & ~si.is_valid()
             result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
         if light.met is not None:
-            found = light.met(si, ray, active & mirrored & counts)
-            result += dr.select(active & mirrored & counts, throughput * found, 0)
+            meets = active & counts & (depth > 0)
+            radiance, sampled = light.met(si, ray, meets)
+            share = dr.select(mirrored | (sampled == 0), 1, density / (density + sampled))
+            result += dr.select(meets & ~dr.all(radiance == 0), throughput * radiance * share, 0)
         active &= si.is_valid() & (depth < bounces)
 
         # Light, from one direction
-        towards, irradiance, reach = light.sample(si, rng)
+        towards, irradiance, reach, chance = light.sample(si, rng)
         bsdf = si.bsdf(ray)
-        value, _, sample, weight = bsdf.eval_pdf_sample(
+        value, other, sample, weight = bsdf.eval_pdf_sample(
             context,
             si,
             si.to_local(towards),
@@ -261,19 +266,21 @@ def trace_reflected(
         lit = active & ~dr.all(value == 0) & (counts | ~rough)
         shadow = si.spawn_ray(towards) if reach is None else si.spawn_ray_to(si.p + towards * reach)
         lit &= ~scene.ray_test(shadow, lit)
+        if light.met is not None:
+            irradiance *= dr.select(chance > 0, chance / (chance + other), 1)
         result += dr.select(lit, throughput * value * irradiance, 0)
 
         # Next surface
         depth += 1
         throughput *= weight
         ray = si.spawn_ray(si.to_world(sample.wo))
-        mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        mirrored, density = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), sample.pdf
         counts |= ~mirrored & ~rough
         active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
         if light.contains is None and light.met is None:
             active &= depth < bounces
-        else:  # one more ray after the last mirror, to see the light itself
-            active &= (depth < bounces) | mirrored & (depth == bounces)
+        else:  # one more ray, or one after the last mirror, to see the light itself
+            active &= (depth < bounces) | (mirrored | mi.Mask(light.met is not None)) & (depth == bounces)
 
         # Russian roulette
         survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(dr.abs(throughput)), 0.95), 1)

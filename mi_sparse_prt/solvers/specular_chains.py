@@ -34,6 +34,7 @@ LEAST = 1e-6  # share of light that a specular surface is taken to send on
 LONGEST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 
 Sparse: TypeAlias = scipy.sparse.csr_array
+Doubles: TypeAlias = NDArray[np.float64]
 
 
 class Cells(NamedTuple):
@@ -151,13 +152,11 @@ class SpecularChains:
         """Sums of few columns, however bright, in the order of rays."""
         sums, squares = np.zeros((3, n * self._size)), np.zeros(len(strata))
         for ends in self._follow(*rays, True):
-            kept = ends.valid.numpy()
-            of, column = ends.of.numpy()[kept], ends.column.numpy()[kept]
-            weight = ends.weight.numpy()[:, kept].astype(np.float64)
+            of, column, weight = _kept(ends)
             share, place = 1 / (CELLS * strata[of].astype(float)) ** 2, rows[of] * self._size + column
             for total, own in zip(sums, weight, strict=True):
-                total += np.bincount(place, own * share, len(total))
-            squares += np.bincount(of, weight.max(axis=0) ** 2, len(squares))
+                np.add.at(total, place, own * share)
+            np.add.at(squares, of, weight.max(axis=0) ** 2)
         light = [scipy.sparse.csr_array(total.reshape(n, -1).astype(np.float32)) for total in sums]
         return ArrivedLight(light, squares.astype(np.float32))
 
@@ -200,11 +199,10 @@ class SpecularChains:
         found = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(max(self._apart - 1, 1))]
         for depth, ends in enumerate(self._follow(ray, row, rng, False)):
             if depth + 1 < self._longest:  # light of a surface at the end makes one more bounce
-                kept = ends.valid.numpy()
-                weight = ends.weight.numpy().mean(axis=0)[kept] / np.float32(rays)
-                place = ends.of.numpy()[kept], ends.column.numpy()[kept]
+                of, column, weight = _kept(ends)
+                mean = (weight.mean(axis=0) / rays).astype(np.float32)
                 found[depth if self._apart else 0] += scipy.sparse.coo_array(
-                    (weight, place), shape=shape
+                    (mean, (of, column)), shape=shape
                 ).tocsr()
         return found
 
@@ -389,6 +387,16 @@ class SpecularChains:
         sample, weight = si.bsdf().sample(single, si, u, v, active & ~rough)
         every, its = si.bsdf().sample(mi.BSDFContext(), si, u, v, active & rough)
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
+
+
+def _kept(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Doubles]:
+    """Numbers (m,), columns and weights (3, m) of rays that are valid, which are few."""
+    index = dr.compress(ends.valid)
+    if len(index) == 0:  # nothing is gathered of nothing
+        return np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((3, 0))
+    of, column, weight = (dr.gather(type(x), x, index) for x in (ends.of, ends.column, ends.weight))
+    dr.eval(of, column, weight)
+    return of.numpy(), column.numpy(), weight.numpy().astype(np.float64)
 
 
 def _compressed(sums: list[mi.UInt32], shape: tuple[int, int]) -> list[Sparse]:

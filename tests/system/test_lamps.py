@@ -282,14 +282,16 @@ def assert_means_are_those_of_path(
     scene, transport, parts: dict[str, tuple], spp: int, seeds: int, light=LIGHT, noisy: float = 0.0025
 ) -> None:
     """Of parts of the picture, within three standard errors, each below a share, and 1.25%."""
-    depth, ours = transport.max_depth, prt.render(scene, transport, light, 0, 256)
+    depth = transport.max_depth
+    ours = np.array([prt.render(scene, transport, light, 0, 256, seed) for seed in range(seeds)])
     with transport.emission.scene_lit_by(light, scene) as lit:
         found = np.array([path_image(lit, scene.sensor(0), depth, spp, seed) for seed in range(seeds)])
     for name, part in parts.items():
-        means = found[:, *part].mean(axis=(1, 2, 3), dtype=np.float64)
-        noise, known = np.std(means, ddof=1) / np.sqrt(seeds), means.mean()
-        print(f"{name}: {ours[part].mean() / known - 1:+.2%}, noise {noise / known:.3%}")
-        assert ours[part].mean() == pytest.approx(known, abs=3 * noise + 0.0125 * known), name
+        means = [x[:, *part].mean(axis=(1, 2, 3), dtype=np.float64) for x in (ours, found)]
+        noise = np.hypot(*(np.std(x, ddof=1) for x in means)) / np.sqrt(seeds)
+        mean, known = (x.mean() for x in means)
+        print(f"{name}: {mean / known - 1:+.2%}, noise {noise / known:.3%}")
+        assert mean == pytest.approx(known, abs=3 * noise + 0.0125 * known), name
         assert noise < noisy * known, name
 
 

@@ -222,7 +222,7 @@ def test_what_rough_glass_focuses(folder, artefact, lamp):
     """
     ball = """<shape type="sphere"><bsdf type="roughdielectric"><float name="alpha" value="0.2"/></bsdf>
         <point name="center" x="-0.4" y="-0.5" z="0.2"/><float name="radius" value="0.4"/></shape>"""
-    bias, error, distance = beside_path(load(folder, lamp + ball, 12), 12, artefact)
+    bias, error, distance = beside_path(load(folder, lamp + ball, 12), 12, artefact, 1024)
     assert error < 0.002
     assert abs(bias) < 4 * error + 0.002
     assert distance < 0.03

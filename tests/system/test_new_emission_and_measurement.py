@@ -47,15 +47,18 @@ class PointLights:
 
     def sample(
         self, element: mi.UInt32, position: mi.Point3f, uv: mi.Point2f
-    ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
+    ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float, mi.Float]:
         way = dr.gather(mi.Point3f, self._positions, element) - position
         distance = dr.norm(way)
-        return way / distance, mi.Color3f(1 / (distance * distance)), distance
+        return way / distance, mi.Color3f(1 / (distance * distance)), distance, mi.Float(0)
 
     def element_of(
         self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
     ) -> tuple[mi.Int32, mi.Color3f]:
         return mi.Int32(-1), mi.Color3f(0)  # nobody sees a point
+
+    def density(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
+        return mi.Float(0)
 
     @contextmanager
     def scene_lit_by(self, light: Any, scene: prt.Scene) -> Iterator[mi.Scene]:
