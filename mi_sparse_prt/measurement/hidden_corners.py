@@ -6,8 +6,10 @@ wall has corners on both sides of it; what lies on one side is lit by the corner
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import drjit as dr
@@ -19,6 +21,8 @@ from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
 
 TRIANGLES = 1 << 20  # at a time
+NARROW = 1 / 16  # of the size of a triangle, its area's root: in narrower gaps light changes too fast for it
+ASIDE = 1 / 8  # of the way from a corner to the middle, where it is asked whether that is in a gap
 SHORT = 0.99  # of the way to a corner: what is met beyond hides nothing
 
 _KNOWN: WeakKeyDictionary[Scene, HiddenCorners] = WeakKeyDictionary()
@@ -74,6 +78,10 @@ class HiddenCorners:
         found = copy(self)
         found._scene, found._corners = scene.mitsuba, scene.to_world(self._corners)
         found._unit = 1 / scene.scale
+        vars(found).pop("_gaps", None)  # those of the other frame
+        found.some = (
+            bool(dr.any(found._gaps != 0)) or self.some
+        )  # gaps are found here, and not while a loop is traced
         return found
 
     def weights(
@@ -86,6 +94,9 @@ class HiddenCorners:
     ) -> list[mi.Float]:
         """Barycentric weights of points, those of hidden corners 0 where another one is seen; they add to 1.
 
+        Corners in a narrow gap are hidden from points that are in none, and the others from those that are in one:
+        what stands a millimetre before a wall leaves the wall dark up to its edge, not beyond.
+
         Parameters
         ----------
         triangle : UInt32
@@ -96,7 +107,16 @@ class HiddenCorners:
         active : Mask
         """
         cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
-        seen = [~self._hides(3 * triangle + k, point, self._side(triangle, way, cut), cut) for k in range(3)]
+        gaps = dr.gather(mi.UInt8, self._gaps, triangle, active)
+        p, normal = self._placed(triangle, active)
+        front = dr.dot(normal, way) < 0
+        normal = dr.select(front, normal, -normal)
+        seen = [~self._hides(3 * triangle + k, point, normal, cut) for k in range(3)]
+        cut |= gaps != 0
+        inside = cut & self._is_narrow(point, normal, _height(p), cut)
+        for k in range(3):
+            corner_inside = (gaps & dr.select(front, mi.UInt8(1 << k), mi.UInt8(8 << k))) != 0
+            seen[k] &= corner_inside == inside
         none = ~(seen[0] | seen[1] | seen[2])
         kept = [dr.select(k | none, dr.maximum(w, 1e-6), 0) for k, w in zip(seen, weights, strict=True)]
         total = kept[0] + kept[1] + kept[2]
@@ -162,6 +182,27 @@ class HiddenCorners:
             crossed |= (a & b) | (b & c) | (c & a)
         return crossed
 
+    @cached_property
+    def _gaps(self) -> mi.UInt8:
+        """Which corners of each triangle are in a gap that is narrow for it: three bits for the front, three behind."""
+        gaps = np.zeros(dr.width(self._corners) // 3, np.uint8)
+        for a in range(0, len(gaps), TRIANGLES):
+            p, normal = self._placed(dr.arange(mi.UInt32, a, min(a + TRIANGLES, len(gaps))), mi.Mask(True))
+            middle, height, found = (p[0] + p[1] + p[2]) / 3, _height(p), mi.UInt32(0)
+            for bit, (side, corner) in enumerate(itertools.product((normal, -normal), p)):
+                narrow = self._is_narrow(dr.lerp(corner, middle, ASIDE), side, height, mi.Mask(True))
+                found |= dr.select(narrow, mi.UInt32(1 << bit), 0)
+            gaps[a : a + TRIANGLES] = found.numpy()
+        return mi.UInt8(gaps)
+
+    def _is_narrow(
+        self, point: mi.Point3f, normal: mi.Vector3f, height: mi.Float, active: mi.Mask
+    ) -> mi.Mask:
+        """Whether there is less room than so much above points."""
+        ray = mi.Ray3f(dr.fma(normal, ray_offset(point, self._unit), point), normal)
+        ray.maxt = height
+        return self._scene.ray_test(ray, active)
+
     def _placed(self, triangle: mi.UInt32, active: mi.Mask) -> tuple[list[mi.Point3f], mi.Vector3f]:
         """The corners of triangles, and their normals."""
         p = [dr.gather(mi.Point3f, self._corners, 3 * triangle + k, active) for k in range(3)]
@@ -173,6 +214,11 @@ class HiddenCorners:
         ray = mi.Ray3f(lifted, end - start)
         ray.maxt = mi.Float(SHORT)
         return self._scene.ray_test(ray, active)
+
+
+def _height(p: Sequence[mi.Point3f]) -> mi.Float:
+    """Of gaps that are narrow for triangles, by their corners."""
+    return NARROW * dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
 
 
 def _chosen(weights: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
