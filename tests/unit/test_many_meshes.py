@@ -14,6 +14,7 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene import scene as scene_module
 from mi_sparse_prt.scene.scene import FEW_MESHES, TOGETHER
+from mi_sparse_prt.scene.triangle_mesh import connected_pieces, unique_rows
 from mi_sparse_prt.solvers.problem import Problem, diffuse_problem
 
 LIGHTING = prt.CubemapLighting(4)
@@ -181,3 +182,22 @@ def test_meshes_of_one_material_are_traced_as_one(monkeypatch):
     assert apart.hash == scene.hash
     for ours, known in zip(found, rows(apart), strict=True):
         np.testing.assert_array_equal(ours, known)
+
+
+def test_matrices_of_a_sky_build_no_shapes_in_world_space():
+    """Rationale: a thousand shapes that are alive make every kernel slower to trace; lamps and cameras need them."""
+    scene = crowd(4)
+    prt.precompute(scene, LIGHTING, Plan("exact", "gather", 16, 0.1), progress=False)
+    assert "mitsuba" not in vars(scene)
+    assert [shape.id() for shape in scene.mitsuba.shapes()] == [mesh.name for mesh in scene.fronts]
+
+
+def test_pieces_of_all_meshes_are_those_of_each(scene):
+    """Expected: numbered mesh by mesh; two that touch are apart, and a cube of 24 vertices is one."""
+    count = 0
+    for mesh in scene.meshes:
+        first, same = unique_rows(scene.positions[mesh.vertices])
+        own, of_place = connected_pieces(same[mesh.triangles], len(first))
+        np.testing.assert_array_equal(scene.pieces[mesh.vertices], count + of_place[same])
+        count += own
+    assert count == len(scene.meshes)
