@@ -192,22 +192,25 @@ class SceneEmitters:
         self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask
     ) -> tuple[mi.Int32, mi.Color3f]:
         """The element whose light rays meet, -1 for none, and its radiance along them."""
+        emitter, group = self._met(si, active)
+        return group, dr.select(group >= 0, mi.Color3f(emitter.eval(si, group >= 0)), 0)
+
+    def density(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
+        """Of a ray's direction among samples, see ``SampledEmission.density``."""
+        emitter, group = self._met(si, active)
+        known, start = group >= 0, dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.o))
+        start.p = ray.o
+        count = dr.maximum(dr.gather(mi.UInt32, self._count, mi.UInt32(group), known), 1)
+        found = emitter.pdf_direction(start, mi.DirectionSample3f(self._scene, si, start), known)
+        return dr.select(known, found / mi.Float(count), 0)
+
+    def _met(self, si: mi.SurfaceInteraction3f, active: mi.Mask) -> tuple[mi.EmitterPtr, mi.Int32]:
+        """What shines where rays end, and its element; -1 for none."""
         emitter = si.emitter(self._scene, active)
         known = active & (emitter != None)  # noqa: E711 - an array of pointers
         number = dr.gather(mi.Int32, self._number_of, dr.reinterpret_array(mi.UInt32, emitter), known)
         known &= (number >= 0) & (number < len(self._group_of))
-        group = dr.select(known, dr.gather(mi.Int32, self._group_of, mi.UInt32(number), known), -1)
-        return group, dr.select(known, mi.Color3f(emitter.eval(si, known)), 0)
-
-    def density(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask) -> mi.Float:
-        """Of a ray's direction among samples, see ``SampledEmission.density``."""
-        emitter, (group, _) = si.emitter(self._scene, active), self.element_of(si, ray, active)
-        start = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.o))
-        start.p = ray.o
-        known = active & (group >= 0)
-        count = dr.gather(mi.UInt32, self._count, mi.UInt32(group), known)
-        found = emitter.pdf_direction(start, mi.DirectionSample3f(self._scene, si, start), known)
-        return dr.select(known, found / mi.Float(dr.maximum(count, 1)), 0)
+        return emitter, dr.select(known, dr.gather(mi.Int32, self._group_of, mi.UInt32(number), known), -1)
 
     def attributes(self) -> dict[str, Any]:
         return {"groups": self.groups}

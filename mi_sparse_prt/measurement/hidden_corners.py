@@ -1,7 +1,8 @@
 """Corners of triangles behind a wall: one that passes through a triangle has light on one side, and other on the other.
 
 Light is known at vertices, and interpolated between them. Of a floor that goes on below a wall, a triangle under the
-wall has corners on both sides of it; what lies on one side is lit by the corners on that side.
+wall has corners on both sides of it; what lies on one side is lit by the corners on that side. Behind a board that is
+just before a wall it is dark: corners there light no point beside the board.
 """
 
 from __future__ import annotations
@@ -79,9 +80,8 @@ class HiddenCorners:
         found._scene, found._corners = scene.mitsuba, scene.to_world(self._corners)
         found._unit = 1 / scene.scale
         vars(found).pop("_gaps", None)  # those of the other frame
-        found.some = (
-            bool(dr.any(found._gaps != 0)) or self.some
-        )  # gaps are found here, and not while a loop is traced
+        in_gaps = bool(dr.any(found._gaps != 0))  # found now, and not while a loop is traced
+        found.some = self.some or in_gaps
         return found
 
     def weights(

@@ -390,7 +390,7 @@ class SpecularChains:
 
 
 def _kept(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Doubles]:
-    """Numbers (m,), columns and weights (3, m) of rays that are valid, which are few."""
+    """Numbers (m,), columns and weights (3, m) of rays that are valid."""
     index = dr.compress(ends.valid)
     if len(index) == 0:  # nothing is gathered of nothing
         return np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((3, 0))
