@@ -17,6 +17,7 @@ from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.space import SampledEmission
+from mi_sparse_prt.emission.unit_lamps import UnitLamps
 from mi_sparse_prt.estimation.darkness import DARK
 from mi_sparse_prt.estimation.held_out import HeldOutError, held_out_error
 from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
@@ -329,11 +330,12 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
     if settings.terms == AUTO_TERMS:
         _warn_if_glossy(problem.scene, "a matrix of lamps has no terms")
     settings, method = replace(settings, terms=0), settings.method
+    seen = not isinstance(problem.emission, UnitLamps)  # pictures find the light that lamps send on directly
     if method == "gather" or (method == "auto" and problem.scene.diffuse):
-        settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run)
+        settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run, seen=seen)
     else:
         settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
-        parts = path_traced_lamps(problem, run, settings.samples)
+        parts = path_traced_lamps(problem, run, settings.samples, seen=seen)
     transport = matrix_of(problem, parts)
     with run.clock.phase("held_out"):
         error = held_out_lamp_error(problem, transport, run.seed)

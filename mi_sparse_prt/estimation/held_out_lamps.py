@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,14 @@ ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has f
 SPP = 256
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 
+Doubles: TypeAlias = NDArray[np.float64]
+
 
 def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) -> HeldOutError:
-    """Estimate the relative L2 error of a matrix of lamps; see ``held_out_error``."""
+    """Estimate the relative L2 error of a matrix of lamps; see ``held_out_error``.
+
+    Of a matrix that has only what surfaces reflect, that is the error of this, relative to what lamps send on, too.
+    """
     stream = random_stream(seed, HELD_OUT)
     rng, m, seeds = np.random.default_rng(stream), problem.emission.size, element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
@@ -36,9 +41,10 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
     # those of all groups at once: each evaluation starts dozens of kernels
     ours = transport.incident.elements(*asked).astype(np.float64)
-    x, y = (_true(problem, asked, *pair) for pair in (seeds[:2], seeds[2:]))
+    seen = "direct" in transport.operators
+    x, y = (_true(problem, asked, seen, *pair) for pair in (seeds[:2], seeds[2:]))
     power = albedo[asked[0]] ** 2
-    sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x, ours - y), (x, y)))
+    sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x.light, ours - y.light), (x.all, y.all)))
     weights = np.repeat(sizes / counts, m * counts)
     columns = weights, *(column[:, None] for column in sums)
     ends = np.cumsum(m * counts)[:-1]
@@ -48,16 +54,26 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     )
 
 
-def _true(problem: Problem, asked: tuple[Any, Any], rays: int, paths: int) -> NDArray[np.float64]:
-    """Unit-albedo light (m, 3) at listed elements, by the seeds of both."""
-    found = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
-    if problem.max_depth != 2:
-        found += light_by_paths(problem, *asked, SPP, paths)[0]
-        found += _by_mirrors(problem, asked, rays)
-    return found
+class _True(NamedTuple):
+    """Unit-albedo light (m, 3) of listed elements: such as is in a matrix, and all of it."""
+
+    light: Doubles
+    all: Doubles
 
 
-def _by_mirrors(problem: Problem, asked: tuple[Any, Any], seed: int) -> NDArray[np.float64]:
+def _true(problem: Problem, asked: tuple[Any, Any], seen: bool, rays: int, paths: int) -> _True:
+    """Light that nothing reflected is in the matrix if it is ``seen``; by the seeds of rays and of paths."""
+    sent = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
+    if problem.max_depth == 2:
+        return _True(sent, sent)
+    reflected = light_by_paths(problem, *asked, SPP, paths)[0].astype(np.float64)
+    if not seen:
+        return _True(reflected, sent + reflected)
+    every = sent + reflected + _by_mirrors(problem, asked, rays)
+    return _True(every, every)
+
+
+def _by_mirrors(problem: Problem, asked: tuple[Any, Any], seed: int) -> Doubles:
     """What mirrors and glass bring (m, 3): rays into each cell that sees any."""
     found = np.zeros((len(asked[0]), 3))
     if problem.scene.bends_light:

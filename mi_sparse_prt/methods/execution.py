@@ -140,13 +140,14 @@ class Execution:
         sources, known = problem.at_vertices, light
         if sources is not problem:  # vertices know the light that surfaces send out
             known = self._direct_of(sources)
+        assert known.direct is not None  # it is the first light that bounces
         with clock.phase("gather_rays"):
             nodes = choose_nodes(problem.scene, sources.points)
             gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
         with clock.phase("interreflection"):
             specular = None if known.specular is None else known.specular.operator
             if sources is problem:
-                part = gather.indirect(light.direct, plan.tolerance, specular)
+                part = gather.indirect(known.direct, plan.tolerance, specular)
             else:
                 part = gather.seen_from(problem, known.direct, plan.tolerance, specular)
         rays = light.rays | {"gather": gather.rays}
@@ -223,9 +224,9 @@ def _left_out(part: Gathered | GatheredByDepth) -> list[str]:
 
 def matrix_of(problem: Problem, parts: MethodResult) -> LightTransport:
     """The matrix of parts that were evaluated, without a report."""
-    operators = {"direct": parts.direct} | ({} if parts.indirect is None else {"indirect": parts.indirect})
-    if parts.specular is not None:
-        operators["specular"] = parts.specular.operator
+    specular = None if parts.specular is None else parts.specular.operator
+    every = {"direct": parts.direct, "indirect": parts.indirect, "specular": specular}
+    operators = {name: operator for name, operator in every.items() if operator is not None}
     return LightTransport(
         problem.emission,
         problem.basis,

@@ -22,7 +22,9 @@ NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct li
 SPP = 64  # paths of an element, where nothing else says how many
 
 
-def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16) -> MethodResult:
+def gathered_lamps(
+    problem: Problem, run: Run, rays: int = 256, strata: int = 16, seen: bool = True
+) -> MethodResult:
     """By finite elements: diffuse scenes.
 
     Parameters
@@ -34,6 +36,8 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
         Per vertex and per point, that gather indirect light; a power of two.
     strata : int
         strata**2 shadow rays per point and lamp.
+    seen : bool
+        Whether direct light is part of the result; without, it is what surfaces reflect of it.
     """
     sources = problem.at_vertices
     direct, arriving = _direct(problem, run, strata)
@@ -49,20 +53,24 @@ def gathered_lamps(problem: Problem, run: Run, rays: int = 256, strata: int = 16
                 indirect = _seen_from(problem, own + indirect, rays, run.seed)
                 traced += len(problem.points) * rays
     counts = {"direct": direct[..., 0].size * strata**2, "specular": arriving, "gather": traced}
-    return _result(problem, direct, indirect, counts)
+    return _result(direct if seen else None, indirect, counts)
 
 
-def path_traced_lamps(problem: Problem, run: Run, spp: int = SPP, strata: int = 16) -> MethodResult:
-    """By path tracing: any BSDF; ``spp`` paths of an element at least."""
-    direct, arriving = _direct(problem, run, strata)
-    (n, m, _), indirect, traced = direct.shape, None, 0
+def path_traced_lamps(
+    problem: Problem, run: Run, spp: int = SPP, strata: int = 16, seen: bool = True
+) -> MethodResult:
+    """By path tracing: any BSDF; ``spp`` paths of an element at least. See ``gathered_lamps``."""
+    n, m = len(problem.points), problem.emission.size
+    direct, indirect, rays = None, None, {}
+    if seen:
+        direct, arriving = _direct(problem, run, strata)
+        rays = {"direct": n * m * strata**2, "specular": arriving}
     if problem.max_depth != 2:
         with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
             asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
-            indirect, traced = light_by_paths(problem, *asked, spp, run.seed, bar.update)
-            indirect = indirect.reshape(direct.shape)
-    rays = {"direct": n * m * strata**2, "specular": arriving, "indirect_paths": traced}
-    return _result(problem, direct, indirect, rays)
+            indirect, rays["indirect_paths"] = light_by_paths(problem, *asked, spp, run.seed, bar.update)
+            indirect = indirect.reshape(n, m, 3)
+    return _result(direct, indirect, rays)
 
 
 def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, int]:
@@ -100,12 +108,8 @@ def _blocks(count: int, size: int, name: str, run: Run) -> Any:
             bar.update(len(ids))
 
 
-def _result(problem: Problem, direct: Floats, indirect: Floats | None, rays: dict[str, int]) -> MethodResult:
-    elements = direct[..., 0].size
-    return MethodResult(
-        Dense(direct),
-        None if indirect is None else Dense(indirect),
-        elements,
-        {"direct": elements, "indirect": 0 if indirect is None else elements},
-        rays,
-    )
+def _result(direct: Floats | None, indirect: Floats | None, rays: dict[str, int]) -> MethodResult:
+    parts = {"direct": direct, "indirect": indirect}
+    elements = {name: 0 if light is None else light[..., 0].size for name, light in parts.items()}
+    seen, reflected = (None if light is None else Dense(light) for light in parts.values())
+    return MethodResult(seen, reflected, max(elements.values()), elements, rays)

@@ -18,7 +18,8 @@ class MethodResult:
 
     Attributes
     ----------
-    direct : Operator
+    direct : Operator or None
+        None where only light that surfaces reflect is asked for: of lamps, which pictures sample themselves.
     indirect : Operator or None
     elements_evaluated : int
         Elements (vertex, direction) at which anything was evaluated, direct or indirect.
@@ -39,7 +40,7 @@ class MethodResult:
         Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
     """
 
-    direct: Operator
+    direct: Operator | None
     indirect: Operator | None
     elements_evaluated: int
     elements: dict[str, int]
