@@ -255,7 +255,8 @@ class _Attempts:
             errors.append(found.total)
             if found.total <= target or found.dark:
                 break
-            if not proposals.after(found, self._run.clock.report()["total"]):
+            of_rays = attempts[-1].radiosity.get("error_of_rays", math.inf)
+            if not proposals.after(found, self._run.clock.report()["total"], of_rays):
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))

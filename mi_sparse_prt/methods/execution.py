@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -173,7 +174,9 @@ class Execution:
             part, noise = glossy_indirect(problem, direct, plan.rays, plan.tolerance, nodes, seed, specular)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays}
-        account = _account(part) | {"noise_of_rays": noise}
+        # the rank that leaves this out grows with the rays, too
+        refinable = math.hypot(noise.bounce, part.left_out) * noise.share
+        account = _account(part) | {"noise_of_rays": noise.bounce, "error_of_rays": refinable}
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=account)
 
     def _path_traced(self, plan: Plan, light: MethodResult) -> MethodResult:

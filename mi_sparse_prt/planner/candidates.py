@@ -56,17 +56,19 @@ class RefinementSchedule:
         self.plan, *self._others = plans
         self._limit, self._started, self._error = limit, started, math.inf
 
-    def after(self, found: HeldOutError, elapsed: float) -> bool:
+    def after(self, found: HeldOutError, elapsed: float, of_rays: float = math.inf) -> bool:
         """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
 
-        More rays make light more exact that is gathered, and no other.
+        More rays make light more exact that is gathered, and no other; of that, what comes ``of_rays``, where it is
+        known.
         """
         if not self._others:
             return False
         before, following = self.plan, self._others[0]
         if before.indirect == "gather" and _kind(before) == _kind(following):
             more = following.rays / before.rays
-            least = math.sqrt(max(found.total**2 - found.parts["indirect"] ** 2 * (1 - 1 / more), 0.0))
+            refinable = min(found.parts["indirect"], of_rays)
+            least = math.sqrt(max(found.total**2 - refinable**2 * (1 - 1 / more), 0.0))
             seconds = elapsed + more * (elapsed - self._started)
             # the most that more rays can do, and what they did last time
             helped = max(least / found.total, found.total / self._error) <= MINIMUM_GAIN
@@ -141,7 +143,7 @@ class CandidatePlans:
         fixed = costs.fixed + costs.direct[direct].seconds
         self._rank(replace(with_direct(costs, direct, costs.direct_share * error), fixed=fixed))
 
-    def after(self, found: HeldOutError, elapsed: float) -> bool:
+    def after(self, found: HeldOutError, elapsed: float, of_rays: float = math.inf) -> bool:
         """Go on to a finer plan, the present one having this error; False if there is none that takes sensible time.
 
         Where what would meet the target takes too long, or nothing would, the next one is at least clearly more exact,
@@ -153,6 +155,8 @@ class CandidatePlans:
         found : HeldOutError
         elapsed : float
             Seconds since the beginning: in all, ``max_seconds`` are not to be exceeded.
+        of_rays : float
+            Not asked for: the costs say what rays leave.
         """
         settings, target, error = self._settings, self._settings.target_error, found.total
         if target is None or len(self._tried) == ATTEMPTS:

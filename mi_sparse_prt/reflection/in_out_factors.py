@@ -56,6 +56,13 @@ class InOutFactors(Reflection):
         tables = np.stack([self._view_means(factors, 1) for factors in self.factors])
         return tables[self.material[self.glossy]]
 
+    @cached_property
+    def row_weights(self) -> Floats:
+        """(rows, 3), by which an error of a row counts: of the radiance that it makes, root mean square over views."""
+        tables = np.stack([self._view_means(factors, 2) for factors in self.factors])
+        lobes = np.sqrt(tables[self.material[self.glossy]])
+        return np.concatenate([self.albedo, lobes.reshape(-1, 3)])
+
     def squares(self, points: slice) -> tuple[NDArray[np.int64], Floats]:
         rows, squares = np.arange(points.start, points.stop)[:, None], np.square(self.albedo[points])[:, None]
         number = int(self.material[points.start])

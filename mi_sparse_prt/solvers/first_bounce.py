@@ -10,7 +10,7 @@ squared error is then 1 + r / (s - r) times the least, s rows and rank r (Drinea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -84,7 +84,7 @@ class FirstBounce:
     Attributes
     ----------
     left : tuple of (n, rank) float32
-        Columns that are nearly orthonormal.
+        Columns that are nearly orthonormal, rows times their weights.
     right : tuple of (rank, n_directions) float32
         Orthogonal rows, the longest first.
     left_out : float
@@ -104,6 +104,7 @@ def first_bounce(
     tolerance: float,
     seed: int,
     options: RandomBasis = USUAL,
+    weights: Floats | None = None,
 ) -> FirstBounce:
     """G rho D for all channels.
 
@@ -120,6 +121,8 @@ def first_bounce(
         Relative L2 error; it is larger where that would take a rank far above 1000.
     seed : int
     options : RandomBasis
+    weights : (n,) float32, optional
+        Above 0: errors of rows count by them.
 
     Returns
     -------
@@ -127,20 +130,25 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrix, albedo, lights, hashes, rng, tolerance, options)
+    if weights is None:
+        weights = np.ones(len(keys), np.float32)
+    columns, turn, missed = _basis(matrix, albedo, lights, weights, hashes, rng, tolerance, options)
     count = options.row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
+    fit *= weights[rows]
     right = [fit @ known for known in _rows(matrix.rows(rows), albedo, lights)]
-    return _truncated(columns, turn, right, missed, tolerance)
+    found = _truncated(columns, turn, right, missed, tolerance)
+    return replace(found, left=tuple(x / weights[:, None] for x in found.left))
 
 
 def _basis(
     matrix: StackedFormFactors,
     albedo: Floats,
     lights: Sequence[Operator],
+    weights: Floats,
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
@@ -163,6 +171,7 @@ def _basis(
     mixed = np.empty((matrix.shape[1], draws * width), np.float32)
     while True:
         block = _combinations(matrix, albedo, lights, mixed, options.mixed, rng)
+        block *= weights[:, None]
         new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]

@@ -128,7 +128,11 @@ class FiniteElements:
     matrix : (n_nodes, n) sparse float32
         G, the sum of all.
     options : LowRankOptions
+    weights : (n_nodes,) float32 or None
+        What errors of rows count by in a low rank, above 0; None where all are alike.
     """
+
+    weights: Floats | None = None
 
     def __init__(
         self,
@@ -255,7 +259,9 @@ class FiniteElements:
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         keys = self._keys[self.nodes.ids]
         matrix = StackedFormFactors([self.matrix])
-        first = first_bounce(matrix, self._albedo, [direct], keys, tolerance, self.seed, self.options.basis)
+        first = first_bounce(
+            matrix, self._albedo, [direct], keys, tolerance, self.seed, self.options.basis, self.weights
+        )
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
@@ -277,15 +283,21 @@ class FiniteElements:
             tolerance,
             self.seed,
             self.options.basis,
+            None if self.weights is None else np.tile(self.weights, count),
         )
         light = [np.split(x, count) for x in first.left]  # [channel][depth]
         sizes = [np.square(right).sum(axis=1, dtype=np.float64) for right in first.right]
-        energies = [sum(map(_energies, x)) * size for x, size in zip(light, sizes, strict=True)]
+        energies = [sum(map(self._energies, x)) * size for x, size in zip(light, sizes, strict=True)]
         least = self.options.later * tolerance**2 * sum(float(e.sum()) for e in energies)
         for s in range(1, count):
             for k in range(s):
                 self._reflect(light, s - 1 - k, k, albedo, sizes, least / count)
         return GatheredByDepth(self._terms(light, sizes, first.right, least), first.left_out)
+
+    def _energies(self, x: Floats) -> NDArray[np.float64]:
+        """Of each column."""
+        own = x if self.weights is None else x * self.weights[:, None]
+        return np.square(own).sum(axis=0, dtype=np.float64)
 
     def _reflect(
         self,
@@ -297,7 +309,7 @@ class FiniteElements:
         least: float,
     ) -> None:
         """Add what light of a depth, the first being 0, becomes by one bounce and some specular surfaces after it."""
-        energies = [_energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
+        energies = [self._energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
         for x, rho, kept in zip(light, albedo, all_but_least(energies, least), strict=True):
             if kept.all():
                 add_scaled(
@@ -315,7 +327,7 @@ class FiniteElements:
         self, light: list[list[Floats]], sizes: list[Doubles], right: Sequence[Floats], least: float
     ) -> tuple[LowRank, ...]:
         """Low ranks of each depth: singular vectors are left out of which it has next to nothing."""
-        every = [_energies(x) * size for own, size in zip(light, sizes, strict=True) for x in own]
+        every = [self._energies(x) * size for own, size in zip(light, sizes, strict=True) for x in own]
         kept = iter(all_but_least(every, least))
         channels = []
         for own, b in zip(light, right, strict=True):
@@ -331,11 +343,11 @@ class FiniteElements:
         of the first one's energy.
         """
         sizes = [np.square(right).sum(axis=1, dtype=np.float64) for right in first.right]
-        least = expendable * sum(_energies(x) @ size for x, size in zip(first.left, sizes, strict=True))
+        least = expendable * sum(self._energies(x) @ size for x, size in zip(first.left, sizes, strict=True))
         totals, light = [x.copy() for x in first.left], list(first.left)
         at = [np.arange(len(size)) for size in sizes]
         for _ in range(count - 1):
-            energies = [_energies(x) * size[i] for x, size, i in zip(light, sizes, at, strict=True)]
+            energies = [self._energies(x) * size[i] for x, size, i in zip(light, sizes, at, strict=True)]
             kept = all_but_least(energies, least)
             at = [i[k] for i, k in zip(at, kept, strict=True)]
             light = self._reflected([x[:, k] for x, k in zip(light, kept, strict=True)])
@@ -498,11 +510,6 @@ def _channel(light: Operator, number: int) -> Operator:
 
 def _is_dark(light: Operator) -> bool:
     return isinstance(light, SparseRows) and not any(matrix.nnz for matrix in light.matrices)
-
-
-def _energies(x: Floats) -> NDArray[np.float64]:
-    """Of each column."""
-    return np.square(x).sum(axis=0, dtype=np.float64)
 
 
 def form_factors(

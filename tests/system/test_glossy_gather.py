@@ -249,12 +249,12 @@ def _materials(scene: Scene, transport: LightTransport) -> list[mi.BSDF | None]:
     ]
 
 
-def test_noise_of_rays_is_known() -> None:
-    """Against the spread of three seeds in the first bounce.
+def test_noise_of_rays_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the spread of three seeds in the first bounce, of which no rank leaves anything out.
 
-    Expected: the spread is at most a third more (halves are less even than all rays, so that noise is rather taken for
-        more than it is) and at least half of it (a rank that leaves out as much as there is noise hides some of it).
-        With eight times the rays it is less than half. No rank is spent on it: of few rays, the basis is smaller.
+    Expected: the spread is at most a third more, and at least half of it (halves are less even than all rays, so that
+        noise is rather taken for more than it is: 0.57 times). With eight times the rays it is less than half. No rank
+        is spent on it: of few rays, the basis is smaller.
     """
     ball = {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.5, "bsdf": PHONG}
     flat = T().rotate([1, 0, 0], -90).scale(2)
@@ -268,12 +268,53 @@ def test_noise_of_rays_is_known() -> None:
             scene, LIGHTING, TERMS, max_depth=3, rays=rays, tolerance=1e-3, seed=seed, progress=False
         )
 
+    usual = bounce(16, 0)
+    many = bounce(128, 0)
+    assert many.report["radiosity"]["noise_of_rays"] < usual.report["radiosity"]["noise_of_rays"] / 2
+    assert max(usual.report["radiosity"]["ranks"]) < max(many.report["radiosity"]["ranks"])
+    monkeypatch.setattr("mi_sparse_prt.solvers.glossy_radiosity.MOST_NOISE", 1e-4)
     few = [bounce(16, seed) for seed in range(3)]
     exact = bounce(2048, 0).indirect.rows(np.arange(n))[..., 0]
     found = [t.indirect.rows(np.arange(n))[..., 0] for t in few]
     pairs = [np.linalg.norm(a - b) / np.sqrt(2) for k, a in enumerate(found) for b in found[:k]]
     known = np.mean([t.report["radiosity"]["noise_of_rays"] for t in few])
     assert 0.5 * known < np.mean(pairs) / np.linalg.norm(exact) < 1.33 * known
-    many = bounce(128, 0)
-    assert many.report["radiosity"]["noise_of_rays"] < known / 2
-    assert max(few[0].report["radiosity"]["ranks"]) < max(many.report["radiosity"]["ranks"])
+
+
+@pytest.mark.parametrize("rays, tolerance", [(64, 0.06), (256, 0.03), (1024, 0.06)])
+def test_what_more_rays_can_take_away_is_known(rays: int, tolerance: float) -> None:
+    """
+    Rationale: of a glossy ball beside a glossy ground, noise of rays and low ranks count as far as they make radiance.
+    Expected: between 0.75 times and twice how far the matrix is from one by 4096 rays (1.42, 1.48 and 1.02 were
+        measured: halves of rays are less even than all).
+    """
+    ball = {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.5, "bsdf": PHONG}
+    flat = T().rotate([1, 0, 0], -90).scale(2)
+    ground = {
+        "type": "rectangle",
+        "to_world": flat,
+        "bsdf": {"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": 0.4, "nonlinear": True},
+    }
+    scene = build(0.3, ball=ball, ground=ground)
+
+    def matrix(rays: int, tolerance: float) -> LightTransport:
+        return precompute_glossy(scene, LIGHTING, TERMS, rays=rays, tolerance=tolerance, progress=False)
+
+    found, exact = matrix(rays, tolerance), matrix(4096, 2e-3)
+    rows = np.arange(exact.incident.shape[0])
+    light = exact.incident.rows(rows)
+    error = _radiance_norm(exact, found.incident.rows(rows) - light) / _radiance_norm(exact, light)
+    assert 0.75 < found.report["radiosity"]["error_of_rays"] / error < 2
+
+
+def _radiance_norm(transport: LightTransport, rows: np.ndarray) -> float:
+    """Of incident light (rows, texels, channels) of all points, as their BRDFs send it on, over views."""
+    reflection, total = transport.reflection, 0.0
+    plain = np.setdiff1d(np.arange(len(reflection.albedo)), reflection.glossy)
+    for some in (plain, reflection.glossy):
+        if len(some):
+            gram = reflection.gram(some)
+            own = rows[reflection.rows_of_each(some, gram.shape[1])]
+            own = np.broadcast_to(own, (*own.shape[:3], 3)).astype(np.float64)
+            total += np.einsum("kabc,kamc,kbmc->", gram, own, own, optimize=True)
+    return float(np.sqrt(total))

@@ -620,7 +620,8 @@ def test_plans_in_turn_end_where_rays_do_not_help():
     """
     Rationale: four times the rays halve the error of gathered light at best, and direct light has its own.
     Expected: on to the next plan after an error of indirect light; not after one of direct light, nor after a plan that
-        was not clearly better than the one before, nor where the next one is to take more seconds than there are.
+        was not clearly better than the one before, nor where the next one is to take more seconds than there are, nor
+        where rays are known to leave only a small part of it.
     """
 
     def found(direct: float, indirect: float) -> HeldOutError:
@@ -634,3 +635,5 @@ def test_plans_in_turn_end_where_rays_do_not_help():
     assert not turns.after(found(0.01, 0.095), 10.0) and turns.plan == plans[1]
     assert turns.after(found(0.01, 0.06), 10.0) and turns.plan == plans[2]
     assert not turns.after(found(0.01, 0.03), 40.0)  # 4 x 30 s more
+    assert not RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, of_rays=0.04)  # 0.092 at best
+    assert RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, of_rays=0.06)

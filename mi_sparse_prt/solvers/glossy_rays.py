@@ -1,0 +1,259 @@
+"""What rays from vertices find of the light that glossy surfaces send out, and how much of it is noise.
+
+Rays are weighted by 1, for unit-albedo light, and by f_k(w) pi / cos, for the terms of a glossy vertex; what they meet
+sends out a diffuse part and g_l(w_o) times its own terms ([HR10] eq. 2-3): one sparse matrix over all of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.threads import run_in_parts
+from mi_sparse_prt.measurement.point_arrays import PointArrays
+from mi_sparse_prt.measurement.vertices import Points
+from mi_sparse_prt.operators.column_blocks import combine_randomly
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.solvers.first_bounce import USUAL
+from mi_sparse_prt.solvers.form_factors import LANES, NOTHING, Surfaces, sobol
+from mi_sparse_prt.solvers.lobes import Lobes
+from mi_sparse_prt.solvers.problem import Problem
+
+NOISE_VERTICES = 4096  # at which noise is looked at, at most
+NOISE_ENTRIES = 1 << 24  # of matrices by which that is done, at most
+
+Floats = NDArray[np.float32]
+LookUp = Callable[[mi.UInt32, mi.Vector3f], list[mi.Float]]  # factors of vertices in directions
+
+
+class Noise(NamedTuple):
+    """What the randomness of rays leaves of the radiance of the first bounce.
+
+    Attributes
+    ----------
+    bounce : float
+        Relative L2.
+    share : float
+        Norm of that radiance, relative to that of all light that surfaces send on, later bounces left out.
+    """
+
+    bounce: float
+    share: float
+
+
+@dataclass(frozen=True)
+class GatherRays:
+    """What rays from some vertices meet, vertex after vertex.
+
+    Attributes
+    ----------
+    points : (n,) int64
+        The vertices, ascending.
+    counts : (n,) int64
+        Of their rays that meet a surface.
+    seen : (m,) int32
+        The vertex that each of these meets.
+    half : (m,) bool
+        To which of two halves of the rays it belongs.
+    into : (rays of glossy vertices, K) float32
+        Weights in the terms of its own vertex.
+    out : (rays that meet glossy vertices, channels * K) float32
+        g_k of ``seen`` towards the ray's origin.
+    per_vertex : int
+        Rays, those that meet nothing among them.
+    """
+
+    points: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    seen: NDArray[np.int32]
+    half: NDArray[np.bool_]
+    into: Floats
+    out: Floats
+    per_vertex: int
+
+    def noise(self, direct: FactoredVisibility, reflection: InOutFactors, points: Points, seed: int) -> Noise:
+        """What their randomness leaves of the first bounce, and in the matrix.
+
+        From how far two halves of them differ, at some vertices and under random sums of columns, in one channel.
+        """
+        order = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
+        rows = np.where(direct.material[self.points] >= 0, 1 + direct.terms, 1)
+        entries = np.cumsum((rows * self.entries(direct.material, direct.terms))[order])
+        which = np.sort(order[: max(1, int(np.searchsorted(entries, NOISE_ENTRIES, side="right")))])
+        ids, n = self.points[which], len(direct.material)
+        light = np.empty((direct.shape[0], min(BITS, direct.shape[1])), np.float32)
+        combine_randomly(direct, USUAL.mixed, np.random.default_rng(seed), light)
+        sent = light.copy()
+        sent[:n] *= reflection.albedo.mean(axis=1)[:, None]
+        x, y = (
+            gather_matrix(direct, self._half(which, half, direct.material), 0, ids) @ sent
+            for half in (False, True)
+        )
+        squares = np.zeros(3)
+        for some in (ids[direct.material[ids] < 0], ids[direct.material[ids] >= 0]):
+            if len(some):
+                gram = reflection.gram(some).mean(axis=3)
+                rows = reflection.rows_of_each(some, gram.shape[1])
+                own = np.where(rows < n, np.searchsorted(ids, rows), rows - n + len(ids))
+                noise, bounce = (x[own] - y[own]) / 2, (x[own] + y[own]) / 2
+                squares += [_squared_norm(gram, part) for part in (noise, bounce, light[rows] + bounce)]
+        noise, bounce, every = np.sqrt(np.maximum(squares, 1e-30))
+        return Noise(float(noise / bounce), float(bounce / every))
+
+    def entries(self, material: NDArray[np.integer], terms: int) -> NDArray[np.int64]:
+        """How many numbers (n,) each row of a point is a sum of: what its rays meet, and the terms of that."""
+        shiny = np.concatenate([[0], np.cumsum(material[self.seen] >= 0)])[row_starts(self.counts)]
+        return self.counts + terms * np.diff(shiny)
+
+    def _half(self, which: NDArray[np.integer], half: bool, material: NDArray[np.integer]) -> GatherRays:
+        """Half of the rays of some points, by their place among all."""
+        chosen = np.zeros(len(self.points), bool)
+        chosen[which] = True
+        kept = np.repeat(chosen, self.counts) & (self.half == half)
+        glossy = np.repeat(material[self.points] >= 0, self.counts)
+        of = np.repeat(np.arange(len(self.points)), self.counts)[kept]
+        return GatherRays(
+            self.points[which],
+            np.bincount(of, minlength=len(self.points))[which],
+            self.seen[kept],
+            self.half[kept],
+            self.into[kept[glossy]],
+            self.out[kept[material[self.seen] >= 0]],
+            self.per_vertex // 2,
+        )
+
+
+def _squared_norm(gram: Floats, light: Floats) -> float:
+    """Squared norm of the radiance of rows (k, R, columns) of points."""
+    return float((gram * np.einsum("kaw,kbw->kab", light, light, optimize=True)).sum(dtype=np.float64))
+
+
+def gather_rays(
+    problem: Problem, outgoing: Floats, rays_per_vertex: int, seed: int, points: NDArray[np.int64]
+) -> GatherRays:
+    """Cosine-distributed rays from vertices.
+
+    Parameters
+    ----------
+    problem : Problem
+        With in-out factors.
+    outgoing : (channels, materials, size, size, K) float32
+        g_k.
+    rays_per_vertex : int
+        A power of two.
+    seed : int
+    points : (n,) integers
+        Vertices, ascending.
+    """
+    assert isinstance(problem.reflection, InOutFactors)
+    surfaces = Surfaces(problem.scene, problem.max_depth)
+    arrays, samples = PointArrays(problem.points), sobol(rays_per_vertex)
+    lobes = Lobes(problem.reflection, outgoing)
+    size = max(1, LANES // rays_per_vertex)
+    blocks = []
+    for a in range(0, len(points), size):
+        some = points[a : a + size]
+        found = surfaces.traced(arrays, mi.UInt32(some.astype(np.uint32)), samples, seed)
+        vertex, point, first, last = found.vertex, found.point, found.ray.d, mi.Vector3f(found.ray.d)
+        dr.eval(point, first, last)
+        dr.scatter(last, found.last, found.gaps)
+        met = dr.compress(vertex < NOTHING)
+        point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, first, last))
+        row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
+        blocks.append((
+            np.bincount(row, minlength=len(some)),
+            mi.Int32(vertex).numpy(),
+            np.bitwise_count(number) % 2 == 1,  # rays are in Morton's order, so that this is a checkerboard
+            _of_glossy(lobes, lobes.incident, point, d),
+            _of_glossy(lobes, lobes.outgoing, vertex, -last),
+        ))  # fmt: skip
+    counts, seen, half, into, out = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    return GatherRays(points, counts, seen, half, into, out, rays_per_vertex)
+
+
+def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.Vector3f) -> Floats:
+    """Factors (lanes, k) of those lanes, few as a rule, whose vertices are glossy."""
+    lanes = dr.compress(lobes.is_glossy(vertex))
+    if not len(lanes):
+        return np.empty((0, len(look_up(mi.UInt32(0), mi.Vector3f(0, 0, 1)))), np.float32)
+    values = look_up(dr.gather(mi.UInt32, vertex, lanes), dr.gather(mi.Vector3f, direction, lanes))
+    dr.eval(values)
+    return np.stack([value.numpy() for value in values], axis=1)
+
+
+def gather_matrix(
+    direct: FactoredVisibility, rays: GatherRays, channel: int, nodes: NDArray[np.integer]
+) -> scipy.sparse.csr_array:
+    """G of one channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms."""
+    n, terms, rows = len(direct.material), direct.terms, len(nodes) + direct.shape[0] - len(direct.material)
+    number = np.full(n, -1)  # of a vertex among the glossy ones
+    number[direct.glossy] = np.arange(len(direct.glossy))
+    node = np.full(n, -1)  # and among the nodes
+    node[nodes] = np.arange(len(nodes))
+    own = slice(channel * terms, (channel + 1) * terms)
+    first = row_starts(rays.counts)
+    shiny = np.concatenate([[0], np.cumsum(number[rays.seen] >= 0)])[
+        first
+    ]  # rays of points before that meet such
+    entries = rays.entries(direct.material, terms)
+    lengths, glossy = np.zeros(rows, np.int64), number[rays.points] >= 0
+    is_node = node[rays.points] >= 0
+    lengths[node[rays.points[is_node]]] = entries[is_node]
+    of_terms = np.zeros(len(direct.glossy), np.int64)
+    of_terms[number[rays.points[glossy]]] = entries[glossy]
+    lengths[len(nodes) :] = np.repeat(of_terms, terms)
+    starts = row_starts(lengths)
+    columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    into = row_starts(np.where(glossy, rays.counts, 0))
+    where = rays.points, first, into, shiny
+    found = rays.into, np.ascontiguousarray(rays.out[:, own]), np.float32(1 / rays.per_vertex)
+    numbers = number, node, len(nodes)
+    run_in_parts(_fill, len(rays.points), where, rays.seen, numbers, found, starts, columns, values)
+    return scipy.sparse.csr_array((values, columns, starts), shape=(rows, direct.shape[0]))
+
+
+@numba.njit(nogil=True, cache=True)
+def _fill(
+    first: int,
+    last: int,
+    where: tuple[NDArray[np.int64], ...],
+    seen: NDArray[np.int32],
+    numbers: tuple[NDArray[np.int64], NDArray[np.int64], int],
+    found: tuple[Floats, Floats, np.float32],
+    starts: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    values: Floats,
+) -> None:
+    """Rows of each point: unit-albedo light, then its terms; entries of a ray likewise."""
+    (points, rays, first_into, first_out), (number, node, nodes) = where, numbers
+    into, out, share = found
+    n, terms = len(number), out.shape[1]
+    for i in range(first, last):
+        own = number[points[i]]
+        for row in range(1 + terms if own >= 0 else 1):
+            if row == 0 and node[points[i]] < 0:
+                continue
+            at = starts[node[points[i]]] if row == 0 else starts[nodes + own * terms + row - 1]
+            shiny = first_out[i]
+            for ray in range(rays[i], rays[i + 1]):
+                weight = share if row == 0 else share * into[first_into[i] + ray - rays[i], row - 1]
+                columns[at], values[at] = seen[ray], weight
+                at += 1
+                other = number[seen[ray]]
+                if other >= 0:
+                    for k in range(terms):
+                        columns[at], values[at] = n + other * terms + k, weight * out[shiny, k]
+                        at += 1
+                    shiny += 1
