@@ -261,7 +261,7 @@ def _powers(source: _Source, seed: int) -> Doubles:
     rays = max(64, PILOT // len(source.emitters))
     number = dr.arange(mi.UInt32, rays * len(source.emitters)) // rays
     _, flux = source.rays(number, _random(dr.width(number), seed, _POWER))
-    power = mi.Float(dr.mean(flux)).numpy().reshape(-1, rays).mean(axis=1, dtype=np.float64)
+    power = mi.Float(dr.sum(flux) / 3).numpy().reshape(-1, rays).mean(axis=1, dtype=np.float64)
     for name, value in zip(source.names, power, strict=True):
         if not np.isfinite(value):
             raise PrtError(f"emitter '{name}' sends out light that is not finite: repair it")

@@ -358,7 +358,7 @@ def _specular(
 
     # holes, beside what is around them
     passed = mi.Color3f(bsdf.eval_null_transmission(si, active & smooth & null))
-    p_hole = dr.clip(dr.mean(passed), 0, 1)
+    p_hole = dr.clip(dr.sum(passed) / 3, 0, 1)
     hole = smooth & null & (u < p_hole)
     factor = dr.select(hole, passed / dr.maximum(p_hole, 1e-6), 1)
     factor = dr.select(smooth & null & ~hole, 1 / dr.maximum(1 - p_hole, 1e-6), factor)

@@ -58,7 +58,9 @@ def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
     """Whether the surfaces that were met have one of some BSDFs."""
     result, own = mi.Mask(False), si.bsdf()
     for bsdf in bsdfs:
-        result |= own == mi.BSDFPtr(bsdf)
+        other = mi.BSDFPtr(bsdf)
+        dr.make_opaque(other)  # its number, which loading may change, is no constant in kernels
+        result |= own == other
     return result
 
 

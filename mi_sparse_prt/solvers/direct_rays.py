@@ -261,7 +261,7 @@ class DirectSolver:
             active,
             most,
             lambda si: si.spawn_ray(ray.d),
-            lambda passed: dr.mean(passed),
+            lambda passed: dr.sum(passed) / 3,  # the number of lanes is a constant in a kernel of dr.mean
         )
         share = dr.select(active, share, 0)
         return _Passed(share, count, (share >= ALL) & (~boundary if apart else True))
@@ -360,7 +360,7 @@ def pass_straight(
         count += dr.select(through, 1, 0)
         boundary |= through & ((flags & scatters) == 0)
         ray = onwards(si)
-        active &= dr.mean(mi.Color3f(share)) > 0
+        active &= dr.max(mi.Color3f(share)) > 0
     return share, count, boundary
 
 

@@ -240,7 +240,7 @@ class Surfaces:
         valid = hit.is_valid()
         if self._passes_straight:
             si = hit.compute_surface_interaction(ray, active=valid)
-            passed = dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, valid)))
+            passed = dr.sum(mi.Color3f(si.bsdf().eval_null_transmission(si, valid))) / 3
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
         first = self._first_triangle.gather(hit.shape, valid)

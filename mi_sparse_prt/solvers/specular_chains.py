@@ -31,6 +31,7 @@ LANES = 1 << 22  # rays per wavefront
 FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
 CELLS = 16  # of a hemisphere, per axis
 LEAST = 1e-6  # share of light that a specular surface is taken to send on
+ONE_KERNEL = dr.ReduceMode.Local  # with a copy of the sums for each thread, their length is a constant in it
 LONGEST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 
 Sparse: TypeAlias = scipy.sparse.csr_array
@@ -176,11 +177,10 @@ class SpecularChains:
             place = dr.gather(mi.UInt32, rows, ends.of, ends.valid) * stride + depth * size + ends.column
             unit = dr.gather(mi.Float, scales, ends.of, ends.valid)
             for c, total in enumerate(sums):
-                dr.scatter_reduce(
-                    dr.ReduceOp.Add, total, mi.UInt32(ends.weight[c] * unit + 0.5), place, ends.valid
-                )
+                light = mi.UInt32(ends.weight[c] * unit + 0.5)
+                dr.scatter_reduce(dr.ReduceOp.Add, total, light, place, ends.valid, ONE_KERNEL)
             square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
-            dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid)
+            dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid, ONE_KERNEL)
 
         dr.eval(rows, scales, *sums, squares)
         self._follow_to_sky(rays, add)

@@ -102,7 +102,7 @@ def _bisected(
     start, middle, end = (dr.gather(mi.Point3f, place, pair) for place in paths)
     low = dr.zeros(mi.Float, len(pairs) + 1)
     for step in range(STEPS):
-        here = low + 0.5 ** (step + 1)
+        here = low + dr.opaque(mi.Float, 0.5 ** (step + 1))  # one kernel for all steps
         on_first = dr.lerp(start, middle, 2 * here)
         on_cube = dr.select(here <= 0.5, on_first, dr.lerp(middle, end, 2 * here - 1))
         seen, _ = direct.trace(point, dr.normalize(mi.Vector3f(on_cube)), mi.Mask(True))
