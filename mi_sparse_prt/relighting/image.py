@@ -191,7 +191,10 @@ class RelitScene:
 
         ``light`` is where light of as many surfaces as it may have met begins among that of all.
         """
-        shares = self._shares(si, corners, u, valid)
+        return self._summed(self._shares(si, corners, u, valid), light, valid)
+
+    def _summed(self, shares: list[Share], light: mi.UInt32, valid: mi.Mask) -> mi.Color3f:
+        """Radiance of shares of coefficients."""
         return sum(
             (
                 weight * dr.gather(mi.Color3f, self._light[term], light + vertex, valid)
@@ -297,8 +300,35 @@ class GlossyRelitScene(RelitScene):
     def _shares(
         self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask
     ) -> list[Share]:
-        shares = super()._shares(si, corners, u, valid)
         glossy, material = self._glossy_at(corners, valid)
+        return super()._shares(si, corners, u, valid) + self._lobes(si, corners, glossy, material)
+
+    def _shaded(
+        self,
+        si: mi.SurfaceInteraction3f,
+        corners: list[Corner],
+        light: mi.UInt32,
+        u: mi.Point2f,
+        valid: mi.Mask,
+    ) -> mi.Color3f:
+        glossy, material = self._glossy_at(corners, valid)
+        # a branch: dozens of look-ups, which most hits are spared
+        lobes = dr.if_stmt(
+            (si, corners, light, glossy, material),
+            glossy,
+            lambda si, corners, light, glossy, material: self._summed(
+                self._lobes(si, corners, glossy, material), light, glossy
+            ),
+            lambda *_: mi.Color3f(0),
+            label="lobes",
+        )
+        return self._summed(super()._shares(si, corners, u, valid), light, valid) + lobes
+
+    def _lobes(
+        self, si: mi.SurfaceInteraction3f, corners: list[Corner], glossy: mi.Mask, material: mi.UInt32
+    ) -> list[Share]:
+        """What terms of BRDFs send on."""
+        shares: list[Share] = []
         towards = si.to_world(si.wi)
         normal = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.sh_frame.n, si.sh_frame.n)
         terms = len(self._light) - 1
