@@ -6,7 +6,6 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 from conftest import BALL, GROUND, PALE, T, build
 
 import mi_sparse_prt as prt
@@ -50,13 +49,12 @@ def _code(kernel: dict[str, object]) -> str:
     return re.sub(r"drjit_[0-9a-f]+|align \d+|, !nontemporal !\d", "", text)
 
 
-@pytest.mark.parametrize("basis", ["direction", "texel"])
-def test_specular_light_of_other_points(basis: str) -> None:
+def test_specular_light_of_other_points() -> None:
     """
     Rationale: a mean of colours by Dr.Jit, and sums with a copy for each thread, have the number of lanes in the code.
     Expected: light of other points, more and of another number, takes no kernel that was not there.
     """
-    here = problem(basis)
+    here = problem("texel")
     ids = np.arange(len(here.points))
     before = compiled_by(lambda: [specular_light(here, 0, ids=some) for some in (ids[::7], ids[1::5])])
     after = compiled_by(lambda: specular_light(here, 1, ids=ids[2::3]))
