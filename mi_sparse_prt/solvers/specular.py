@@ -37,7 +37,6 @@ ENOUGH = (
     1.25  # times the squared noise that is wanted, after a round: another has a ray in each cell at least
 )
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
-SUMS = 1 << 24  # elements at a time in which light is added up: 64 MB for each channel
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 Doubles = NDArray[np.float64]
@@ -226,7 +225,7 @@ class _Arriving:
         found, squares, first = [], [np.zeros(0, np.float32)], 0
         while first < len(lit):
             most = int(np.searchsorted(rays, rays[first] + LANES, side="right")) - 1
-            last = min(max(most, first + 1), first + max(1, SUMS // self._size), len(lit))
+            last = min(max(most, first + 1), len(lit))
             part = slice(starts[first], starts[last])
             here, some = self._ids[lit[first:last]], self._cells.take(part)
             some = some._replace(rows=np.searchsorted(lit[first:last], some.rows))

@@ -7,17 +7,20 @@ form-factor matrix; where it leaves the scene, it is light of the texel that it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
+import numba
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
@@ -28,14 +31,12 @@ from mi_sparse_prt.solvers.lamps import lamp_asked, lamp_met
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
-FIXED_POINT = float(1 << 29)  # of light of a texel, which glass makes 8 at the most
 CELLS = 16  # of a hemisphere, per axis
 LEAST = 1e-6  # share of light that a specular surface is taken to send on
-ONE_KERNEL = dr.ReduceMode.Local  # with a copy of the sums for each thread, their length is a constant in it
 LONGEST = 16  # surfaces on the way, where ``max_depth`` sets no limit
 
 Sparse: TypeAlias = scipy.sparse.csr_array
-Doubles: TypeAlias = NDArray[np.float64]
+Floats: TypeAlias = NDArray[np.float32]
 
 
 class Cells(NamedTuple):
@@ -157,35 +158,20 @@ class SpecularChains:
             share, place = 1 / (CELLS * strata[of].astype(float)) ** 2, rows[of] * self._size + column
             for total, own in zip(sums, weight, strict=True):
                 np.add.at(total, place, own * share)
-            np.add.at(squares, of, weight.max(axis=0) ** 2)
+            np.add.at(squares, of, np.square(weight.max(axis=0), dtype=np.float64))
         light = [scipy.sparse.csr_array(total.reshape(n, -1).astype(np.float32)) for total in sums]
         return ArrivedLight(light, squares.astype(np.float32))
 
     def _of_texels(
         self, rays: _Rays, n: int, rows_of: NDArray[np.int64], strata: NDArray[np.int64]
     ) -> ArrivedLight:
-        """Sums of many columns, of which few are not 0, on the device."""
-        scale = FIXED_POINT / (CELLS * strata.astype(float)) ** 2
-        rows, scales = mi.UInt32(rows_of.astype(np.uint32)), mi.Float(scale.astype(np.float32))
-        columns = self._size * max(self._apart, 1)
-        sums = [dr.zeros(mi.UInt32, n * columns) for _ in range(3)]
-        squares = dr.zeros(mi.UInt32, len(strata))
-        stride, size = dr.opaque(mi.UInt32, columns), dr.opaque(mi.UInt32, self._size if self._apart else 0)
-
-        def add(depth: mi.UInt32, ends: _Ends) -> None:
-            """Whole numbers: sums do not depend on the order of rays."""
-            place = dr.gather(mi.UInt32, rows, ends.of, ends.valid) * stride + depth * size + ends.column
-            unit = dr.gather(mi.Float, scales, ends.of, ends.valid)
-            for c, total in enumerate(sums):
-                light = mi.UInt32(ends.weight[c] * unit + 0.5)
-                dr.scatter_reduce(dr.ReduceOp.Add, total, light, place, ends.valid, ONE_KERNEL)
-            square = mi.UInt32(dr.minimum(dr.square(dr.max(ends.weight)), 64) * 2**16)
-            dr.scatter_reduce(dr.ReduceOp.Add, squares, square, ends.of, ends.valid, ONE_KERNEL)
-
-        dr.eval(rows, scales, *sums, squares)
-        self._follow_to_sky(rays, add)
-        dr.eval(*sums, squares)
-        return ArrivedLight(_compressed(sums, (n, columns)), squares.numpy() / np.float32(2**16))
+        """Sums of many columns, of which few are not 0, in the order of rays."""
+        of, column, weight = self._follow_to_sky(rays)
+        share = (1 / (CELLS * strata.astype(float)) ** 2).astype(np.float32)
+        starts = np.searchsorted(rows_of[of], np.arange(n + 1))
+        shape = n, self._size * max(self._apart, 1)
+        squares = np.bincount(of, np.square(weight.max(axis=0), dtype=np.float64), len(strata))
+        return ArrivedLight(_summed(starts, column, weight * share[of], shape), squares.astype(np.float32))
 
     def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> list[Sparse]:
         """What cosine-distributed rays from some points find after 1, 2, ... specular surfaces, by vertices (n, n_v).
@@ -264,20 +250,19 @@ class SpecularChains:
     def _is_specular(self, si: mi.SurfaceInteraction3f) -> mi.Mask:
         return mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta) | is_one_of(self._rough_glass, si)
 
-    def _follow_to_sky(self, rays: _Rays, add: Callable[[mi.UInt32, _Ends], None]) -> None:
+    def _follow_to_sky(self, rays: _Rays) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Floats]:
         """Rays that end at texels of the sky after any number of specular surfaces, in one kernel.
 
-        Parameters
-        ----------
-        rays : _Rays
-        add : callable
-            What to do with rays that end, in the kernel: of how many surfaces they met, less one, and these rays.
+        Numbers (m,) that they were given, columns (of how many surfaces they met, and a texel), and weights (3, m).
         """
         index, ray, of, rng = self._towards_specular(*rays)
-        if len(index) == 0:
-            return
+        if len(index) == 0:  # no rays at all end the process if they are traced
+            return np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((3, 0), np.float32)
         dr.eval(ray, of, rng)
-        longest = dr.opaque(mi.UInt32, self._longest)
+        longest, size = (
+            dr.opaque(mi.UInt32, self._longest),
+            dr.opaque(mi.UInt32, self._size if self._apart else 0),
+        )
 
         def go_on(
             ray: mi.Ray3f,
@@ -285,14 +270,18 @@ class SpecularChains:
             weight: mi.Color3f,
             straight: mi.Mask,
             met: mi.UInt32,
+            column: mi.UInt32,
+            brought: mi.Color3f,
             alive: mi.Mask,
         ) -> tuple[Any, ...]:
             hit = self._scene.unsplit.ray_intersect_preliminary(ray, active=alive)
-            column, _ = self._light_met(hit, ray, alive & ~straight)
-            add(met - 1, _Ends(of, column, weight, alive & (column != NOTHING) & (dr.max(weight) > 0)))
+            texel, _ = self._light_met(hit, ray, alive & ~straight)
+            ends = alive & (texel != NOTHING) & (dr.max(weight) > 0)
+            column = dr.select(ends, (met - 1) * size + texel, column)
+            brought = dr.select(ends, weight, brought)
             si = hit.compute_surface_interaction(ray, active=alive & hit.is_valid())
             goes_on, ray, weight, null = self._sent_on(si, weight, rng, alive & (met < longest))
-            return ray, rng, weight, straight & null, met + 1, goes_on
+            return ray, rng, weight, straight & null, met + 1, column, brought, goes_on
 
         n = len(index)
         state = (
@@ -301,9 +290,13 @@ class SpecularChains:
             dr.full(mi.Color3f, 1, n),
             dr.full(mi.Mask, True, n),
             mi.UInt32(0),
+            dr.full(mi.UInt32, NOTHING, n),
+            dr.zeros(mi.Color3f, n),
             dr.full(mi.Mask, True, n),
         )
-        dr.while_loop(state, lambda *state: state[-1], go_on, mode="symbolic")
+        *_, column, brought, _ = dr.while_loop(state, lambda *state: state[-1], go_on, mode="symbolic")
+        dr.eval(column, brought)
+        return _kept(_Ends(of, column, brought, column != NOTHING))
 
     def _sent_on(
         self, si: mi.SurfaceInteraction3f, weight: mi.Color3f, rng: mi.PCG32, active: mi.Mask
@@ -389,28 +382,61 @@ class SpecularChains:
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
 
 
-def _kept(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Doubles]:
+def _kept(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Floats]:
     """Numbers (m,), columns and weights (3, m) of rays that are valid."""
     index = dr.compress(ends.valid)
     if len(index) == 0:  # nothing is gathered of nothing
-        return np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((3, 0))
+        return np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((3, 0), np.float32)
     of, column, weight = (dr.gather(type(x), x, index) for x in (ends.of, ends.column, ends.weight))
     dr.eval(of, column, weight)
-    return of.numpy(), column.numpy(), weight.numpy().astype(np.float64)
+    return of.numpy(), column.numpy(), weight.numpy()
 
 
-def _compressed(sums: list[mi.UInt32], shape: tuple[int, int]) -> list[Sparse]:
-    """Matrices of fixed-point numbers on the device, of which few are not 0."""
-    index = dr.compress((sums[0] | sums[1] | sums[2]) != 0)
-    values = [dr.gather(mi.UInt32, total, index) for total in sums] if len(index) else [mi.UInt32()] * 3
-    dr.eval(values)
-    place = index.numpy().astype(np.int64)
-    starts = np.searchsorted(place, np.arange(shape[0] + 1) * shape[1])
-    columns = (place % shape[1]).astype(np.int32)
-    return [
-        scipy.sparse.csr_array((v.numpy() / np.float32(FIXED_POINT), columns, starts), shape=shape)
-        for v in values
-    ]
+def _summed(
+    starts: NDArray[np.int64], columns: NDArray[np.uint32], values: Floats, shape: tuple[int, int]
+) -> list[Sparse]:
+    """Matrices (rows, columns) of each channel from entries, row i's from starts[i] on, of any order within a row."""
+    found, sums = np.empty(len(columns), np.int32), np.empty((len(columns), 3), np.float32)
+    counts = np.empty(shape[0], np.int64)
+    entries = columns, np.ascontiguousarray(values.T)
+    run_in_parts(_sum_rows, shape[0], starts, shape[1], entries, found, sums, counts)
+    rows = np.repeat(np.arange(shape[0]), np.diff(starts))
+    kept = np.arange(len(columns)) - starts[rows] < counts[rows]
+    pointers, indices = row_starts(counts), found[kept]
+    return [scipy.sparse.csr_array((v, indices, pointers), shape=shape) for v in sums[kept].T.copy()]
+
+
+@numba.njit(nogil=True, cache=True)
+def _sum_rows(
+    first: int,
+    last: int,
+    starts: NDArray[np.int64],
+    width: int,
+    entries: tuple[NDArray[np.uint32], Floats],
+    found: NDArray[np.int32],
+    sums: Floats,
+    counts: NDArray[np.int64],
+) -> None:
+    """Entries of equal columns added up, ascending, from where the row's entries begin."""
+    columns, values = entries
+    total, used = np.zeros((width, 3)), np.zeros(width, np.bool_)
+    for i in range(first, last):
+        at = starts[i]
+        for e in range(starts[i], starts[i + 1]):
+            column = columns[e]
+            if not used[column]:
+                used[column] = True
+                found[at] = column
+                at += 1
+            for c in range(3):
+                total[column, c] += values[e, c]
+        counts[i] = at - starts[i]
+        found[starts[i] : at].sort()
+        for k in range(starts[i], at):
+            column = found[k]
+            sums[k] = total[column]
+            total[column] = 0.0
+            used[column] = False
 
 
 def specular_form_factors(problem: Problem, ids: Ids, rays: int, seed: int) -> list[Sparse]:
