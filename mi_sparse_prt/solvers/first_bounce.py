@@ -130,17 +130,18 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    if weights is None:
-        weights = np.ones(len(keys), np.float32)
     columns, turn, missed = _basis(matrix, albedo, lights, weights, hashes, rng, tolerance, options)
     count = options.row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
-    fit *= weights[rows]
+    if weights is not None:
+        fit *= weights[rows]
     right = [fit @ known for known in _rows(matrix.rows(rows), albedo, lights)]
     found = _truncated(columns, turn, right, missed, tolerance)
+    if weights is None:
+        return found
     return replace(found, left=tuple(x / weights[:, None] for x in found.left))
 
 
@@ -148,7 +149,7 @@ def _basis(
     matrix: StackedFormFactors,
     albedo: Floats,
     lights: Sequence[Operator],
-    weights: Floats,
+    weights: Floats | None,
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
@@ -171,7 +172,8 @@ def _basis(
     mixed = np.empty((matrix.shape[1], draws * width), np.float32)
     while True:
         block = _combinations(matrix, albedo, lights, mixed, options.mixed, rng)
-        block *= weights[:, None]
+        if weights is not None:
+            block *= weights[:, None]
         new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]

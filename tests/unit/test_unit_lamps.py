@@ -146,8 +146,8 @@ def test_pictures_ask_for_what_surfaces_reflect(metal: bool) -> None:
     """
     Rationale: pictures sample the lamps themselves; their direct light, and its check, would be for nothing.
     Expected: the indirect part of the matrix of lamps and no other, by finite elements and by paths. The error that it
-        tells is relative to all light: within 20% or 3 standard errors of how far it is from 4096 paths (0.58 +- 0.13 and
-        0.64%; with metal 3.8 +- 0.4 and 3.7%).
+        tells is relative to all light: within 20% or 3 standard errors of how far it is from 4096 paths (0.58 +- 0.13
+        and 0.64%; with metal 3.8 +- 0.4 and 3.7%).
     """
     scene = build(
         0.5,
