@@ -8,9 +8,8 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-import mitsuba as mi
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -36,14 +35,12 @@ from mi_sparse_prt.solvers.specular_chains import specular_form_factors
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 MOST_BOUNCES = 64  # where there is no limit
-NOISE_VERTICES = 4096  # at which noise is looked at
 BESIDE_NOISE = 0.5  # of its square may a low rank leave out: the rank of noise is full
 MOST_NOISE = 0.5  # of the first bounce: a tolerance beyond would leave it out
 LEAST_WEIGHT = 0.05  # of the largest: what hardly matters is not left to chance
 EVEN = 1e-6  # relative difference of channels that is none
 
 Floats = NDArray[np.float32]
-LookUp = Callable[[mi.UInt32, mi.Vector3f], list[mi.Float]]  # factors of vertices in directions
 
 
 class GlossyGather(FiniteElements):
