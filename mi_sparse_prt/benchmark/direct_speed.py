@@ -17,6 +17,7 @@ from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.ray_offsets import ray_offsets
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import diffuse_problem
 
@@ -27,7 +28,7 @@ class BareOcclusion:
     Ray origins are prepared once per point, nothing is packed, and a block leaves one number on the host.
     """
 
-    def __init__(self, scene: mi.Scene, lighting: CubemapLighting, points: Points) -> None:
+    def __init__(self, scene: TracedScene, lighting: CubemapLighting, points: Points) -> None:
         self.scene, self.n_directions = scene, lighting.n_directions
         offset = ray_offsets(points.positions)
         origins = points.positions + offset * points.offset_normals  # [point, xyz]

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.scene.shape_table import first_triangles
 
 COLORMAP = "viridis"
 SUBPIXELS = 3  # rays per pixel and axis
@@ -95,10 +94,10 @@ class _Hits:
 
     def __init__(self, scene: Scene, ray: mi.RayDifferential3f, film_pixels: float) -> None:
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
-        hit = scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(ray))
-        si = hit.compute_surface_interaction(mi.Ray3f(ray))
+        hit = scene.world.ray_intersect_preliminary(mi.Ray3f(ray))
+        si = scene.world.interaction(hit, mi.Ray3f(ray))
         self.valid = hit.is_valid().numpy()
-        triangle = first_triangles(scene.mitsuba).gather(hit.shape, hit.is_valid()) + hit.prim_index
+        triangle = scene.world.triangle(hit, hit.is_valid())
         self._corners = triangles[triangle.numpy()[self.valid]]  # [hit, corner]
         u, v = hit.prim_uv.numpy()[:, self.valid].astype(np.float64)
         self._barycentric = np.stack([1 - u - v, u, v], axis=1)

@@ -77,7 +77,7 @@ class HiddenCorners:
         scene : Scene
         """
         found = copy(self)
-        found._scene, found._corners = scene.mitsuba, scene.to_world(self._corners)
+        found._scene, found._corners = scene.world, scene.to_world(self._corners)
         found._unit = 1 / scene.scale
         vars(found).pop("_gaps", None)  # those of the other frame
         in_gaps = bool(dr.any(found._gaps != 0))  # found now, and not while a loop is traced

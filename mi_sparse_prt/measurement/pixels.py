@@ -13,6 +13,7 @@ from mi_sparse_prt.core.random_keys import hash_rows
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.traced_scene import TracedScene
 
 
 def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed: int = 0) -> Measurement:
@@ -42,7 +43,7 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
     places = jittered_places(width, height, spp, seed)
-    si, reflects = _seen(scene.mitsuba, sensor, places, (width, height))
+    si, reflects = _seen(scene.world, sensor, places, (width, height))
     kept = np.flatnonzero(reflects)
     if not len(kept):
         raise PrtError("the camera sees no surface that reflects; move it, or choose another sensor")
@@ -81,7 +82,7 @@ def jittered_places(width: int, height: int, spp: int, seed: int) -> NDArray[np.
 
 
 def _seen(
-    scene: mi.Scene, sensor: mi.Sensor, places: NDArray[np.float32], size: tuple[int, int]
+    scene: TracedScene, sensor: mi.Sensor, places: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[mi.SurfaceInteraction3f, NDArray[np.bool_]]:
     """What camera rays meet, and which of them meet the front of a surface, or a back that reflects as well."""
     at = mi.Point2f(*(np.ascontiguousarray(places[:, k] / size[k]) for k in range(2)))

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.scene.ray_offsets import ray_offset, ray_offsets
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.scene.shape_table import first_triangles
 
 TRIANGLES = 1 << 20  # at a time
 BEYOND = 2  # ray offsets behind a vertex: what is as near touches it
@@ -57,7 +56,7 @@ def _touched(scene: Scene, positions: Vectors) -> tuple[NDArray[np.int64], Vecto
     triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.meshes])
     piece = scene.pieces[scene.front_of]
     pieces = mi.UInt32(np.concatenate([piece[m.triangles[:, 0] + m.vertices.start] for m in scene.fronts]))
-    first, found = first_triangles(scene.normalised), []
+    found = []
     for a in range(0, len(triangles), TRIANGLES):
         some = triangles[a : a + TRIANGLES]
         p = [mi.Point3f(positions[column].T) for column in some.T]
@@ -70,11 +69,11 @@ def _touched(scene: Scene, positions: Vectors) -> tuple[NDArray[np.int64], Vecto
             beyond = BEYOND * ray_offset(corner) / dr.norm(ray.d)
             ray.maxt = 1 + beyond
             hit = scene.normalised.ray_intersect_preliminary(ray)
-            met = first.gather(hit.shape, hit.is_valid()) + hit.prim_index
+            met = scene.normalised.triangle(hit, hit.is_valid())
             touches = hit.is_valid() & (dr.gather(mi.UInt32, pieces, met, hit.is_valid()) != own)
             touches &= hit.t > 1 - beyond
             which = touches.numpy()
-            other = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, touches).n
+            other = scene.normalised.interaction(hit, ray, touches).n
             found.append((column[which], other.numpy().T[which]))
     vertices, normals = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.lexsort((*normals.T, vertices))  # so that the order of triangles does not show

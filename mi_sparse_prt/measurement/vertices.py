@@ -14,6 +14,7 @@ from mi_sparse_prt.core.random_keys import hash_rows
 from mi_sparse_prt.measurement.touching_vertices import move_off
 from mi_sparse_prt.scene.ray_offsets import ray_offsets
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.traced_scene import TracedScene
 
 
 @dataclass(frozen=True)
@@ -135,12 +136,12 @@ class VertexRays:
         return VertexRays(self.origins[vertices], self.directions[vertices], self.missed[vertices])
 
 
-def vertex_rays(scene: mi.Scene, sheets: Scene | None = None) -> VertexRays:
+def vertex_rays(scene: mi.Scene | TracedScene, sheets: Scene | None = None) -> VertexRays:
     """Find for every mesh vertex of a Mitsuba scene a ray that hits the surface next to it.
 
     Parameters
     ----------
-    scene : mi.Scene
+    scene : mi.Scene or TracedScene
         All its shapes are meshes; vertices are counted in the order of the shapes.
     sheets : Scene, optional
         Whose shapes these are: vertices on the backs of two-sided surfaces follow, seen from there.
@@ -170,7 +171,7 @@ def vertex_rays(scene: mi.Scene, sheets: Scene | None = None) -> VertexRays:
             continue
         ids = owners[chosen]
         o, d, target = _approach(vertices, triangles, corners[chosen], step, height * extent)
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)), coherent=True)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)))
         distance = np.where(hit.is_valid().numpy(), hit.t.numpy(), np.inf)
         good = np.abs(distance - target) < 0.1 * target
         first = attempt == 0
@@ -181,7 +182,7 @@ def vertex_rays(scene: mi.Scene, sheets: Scene | None = None) -> VertexRays:
     return VertexRays(origins, directions, missing)
 
 
-def _merge(scene: mi.Scene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _merge(scene: mi.Scene | TracedScene) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Concatenate all meshes: vertices (n_v, 3) and triangles (n_t, 3) with global indices."""
     vertices, triangles, offset = [], [], 0
     for shape in scene.shapes():

@@ -17,6 +17,7 @@ from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.traced_scene import TracedScene
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
 NEAR_LAMP = 1e-3  # of the way to a lamp: what is met there is the lamp itself
@@ -156,7 +157,11 @@ def background_light(background: mi.Emitter, ray: mi.Ray3f, way: Way, active: mi
 
 
 def reflected_background(
-    background: mi.Emitter, scene: mi.Scene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Mask
+    background: mi.Emitter,
+    scene: TracedScene,
+    si: mi.SurfaceInteraction3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
 ) -> mi.Color3f:
     """Light of the environment that surfaces reflect, by a shadow ray; the rest of it is found by following them."""
     there, light = background.sample_direction(si, mi.Point2f(sampler.next_2d(active)), active)
@@ -169,7 +174,7 @@ def reflected_background(
 def reflected_lamps(
     lamps: SampledEmission,
     brightness: mi.Color3f,
-    scene: mi.Scene,
+    scene: TracedScene,
     si: mi.SurfaceInteraction3f,
     sampler: mi.Sampler,
     active: mi.Mask,

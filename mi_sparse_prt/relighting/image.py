@@ -38,7 +38,6 @@ from mi_sparse_prt.relighting.followed_rays import (
 )
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.scene.shape_table import first_triangles
 from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
@@ -80,7 +79,7 @@ class RelitScene:
         max_depth: int = -1,
         followed: Sequence[mi.BSDF] = (),
     ) -> None:
-        self._scene, self._background, self._lamps = scene.mitsuba, background, lamps
+        self._scene, self._background, self._lamps = scene.world, background, lamps
         self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
         self.goes_on, self.rough_glass = scene.specular or bool(followed), scene.rough_glass
@@ -90,7 +89,6 @@ class RelitScene:
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self._backs = mi.Int32(scene.backs.astype(np.int32))
         self._corners = [mi.UInt32(np.ascontiguousarray(triangles[:, k])) for k in range(3)]  # [triangle]
-        self._first_triangle = first_triangles(self._scene)
         self._hidden = hidden_corners(scene).in_world(scene)
 
     def radiance(
@@ -133,7 +131,7 @@ class RelitScene:
     ) -> Seen:
         """What rays meet after some surfaces; their radiance where it is asked for and they are not followed."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
-        si = hit.compute_surface_interaction(ray, active=active)
+        si = self._scene.interaction(hit, ray, active)
         whole = is_one_of(self.followed, si)
         valid = reflects & si.is_valid() & ~whole
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
@@ -155,7 +153,7 @@ class RelitScene:
         behind: mi.Mask,
     ) -> tuple[list[Corner], mi.Mask]:
         """The vertices around each hit, on the sheet that it is on and on its side of walls; whether it has any."""
-        triangle = self._first_triangle.gather(hit.shape, valid) + hit.prim_index
+        triangle = self._scene.triangle(hit, valid)
         u, v = hit.prim_uv
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
         backs = [dr.gather(mi.Int32, self._backs, vertex, behind) for vertex in vertices]
@@ -174,7 +172,7 @@ class RelitScene:
         For scenes without surfaces that rays go on from (``goes_on``).
         """
         hit = self._scene.ray_intersect_preliminary(ray)
-        si = hit.compute_surface_interaction(ray)
+        si = self._scene.interaction(hit, ray)
         met = si.is_valid()
         corners, lit = self._hit_corners(hit, si, ray, mi.Mask(met), met & (mi.Frame3f.cos_theta(si.wi) < 0))
         return self._shares(si, corners, u, lit), lit, ~met

@@ -28,6 +28,7 @@ from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.surfaces import read_surfaces
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.traversal import places_of_lamps
 from mi_sparse_prt.scene.triangle_mesh import (
     TriangleMesh,
@@ -97,7 +98,7 @@ class Scene:
     mitsuba : mi.Scene
         World space: the meshes of `fronts`, in that order and with these vertices, plus the sensors, emitters
         and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
-    normalised : mi.Scene
+    normalised : TracedScene
         The same surfaces and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
         no sensors. Of more than a dozen meshes, those of one plain material that follow each other are one shape: every
         shape that is alive makes kernels slower to trace, a thousand of them by 0.2 s each time.
@@ -131,7 +132,8 @@ class Scene:
         self._others, self._emission = objects_off_shapes(mitsuba), [k.emission() for k in materials]
         self._surfaces, self._runs = meshes, _alike(materials)
         unit = [self._traced(concatenated(meshes[run]), materials[run.start]) for run in self._runs]
-        self.normalised: mi.Scene = build_mitsuba_scene(unit, [meshes[run.start].name for run in self._runs])
+        names = [meshes[run.start].name for run in self._runs]
+        self.normalised = TracedScene(build_mitsuba_scene(unit, names))
 
         albedo = [k.albedo(build_mitsuba_mesh(m, k.bsdf), m) for m, k in zip(meshes, materials, strict=True)]
         lamps = self._normalise(places_of_lamps(mitsuba))
@@ -221,6 +223,11 @@ class Scene:
         ]
         return build_mitsuba_scene(shapes, [mesh.name for mesh in self._surfaces], self._others)
 
+    @cached_property
+    def world(self) -> TracedScene:
+        """``mitsuba``, for rays that look at its surfaces."""
+        return TracedScene(self.mitsuba)
+
     def unlit_shapes(self) -> list[mi.Mesh]:
         """The world-space meshes without their area emitters, for scenes with other light."""
         return [
@@ -247,7 +254,7 @@ class Scene:
         of_runs = pointers[
             [run.start for run in self._runs]
         ]  # of which none shines, if it is of several shapes
-        return ShapeTable([self.normalised, self.unsplit], np.tile(of_runs, 2))
+        return ShapeTable([self.normalised.mitsuba, self.unsplit.mitsuba], np.tile(of_runs, 2))
 
     def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
         """One of the scene's own cameras by its number; a sensor is passed on.
@@ -324,7 +331,7 @@ class Scene:
         return [material.bsdf for material in self.materials[: len(self.fronts)] if material.rough_glass]
 
     @cached_property
-    def unsplit(self) -> mi.Scene:
+    def unsplit(self) -> TracedScene:
         """The surfaces of ``normalised``, flat ones as they were before their edges were bisected.
 
         For rays that need no vertices: a floor is two triangles, and in a room rays take a half to a third of the time.
@@ -335,31 +342,32 @@ class Scene:
         for run, shape in zip(self._runs, self.normalised.shapes(), strict=True):
             whole = concatenated(self._surfaces[run]).unsplit
             shapes.append(shape if whole is None else self._traced(whole, self.materials[run.start]))
-        return build_mitsuba_scene(shapes, [self._surfaces[run.start].name for run in self._runs])
+        names = [self._surfaces[run.start].name for run in self._runs]
+        return TracedScene(build_mitsuba_scene(shapes, names))
 
     @cached_property
-    def specular_surfaces(self) -> mi.Scene | None:
+    def specular_surfaces(self) -> TracedScene | None:
         """Those of ``unsplit`` from which light goes on as it came, alone: rays that may meet one are found fast."""
         return self._unsplit_surfaces(lambda material: material.single_directions or material.rough_glass)
 
     @cached_property
-    def passing_surfaces(self) -> mi.Scene | None:
+    def passing_surfaces(self) -> TracedScene | None:
         """Those of ``unsplit`` that some light goes straight through."""
         return self._unsplit_surfaces(lambda material: material.passes_straight)
 
     @cached_property
-    def blocking_surfaces(self) -> mi.Scene | None:
+    def blocking_surfaces(self) -> TracedScene | None:
         """Those of ``unsplit`` that no light goes straight through."""
         return self._unsplit_surfaces(lambda material: not material.passes_straight)
 
-    def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> mi.Scene | None:
+    def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> TracedScene | None:
         """A scene of some surfaces of ``unsplit``, in the normalised frame; None for none."""
         which = [k for k, run in enumerate(self._runs) if belongs(self.materials[run.start])]
         shapes = self.unsplit.shapes()
         if len(which) in (0, len(shapes)):
             return self.unsplit if which else None
         names = [self.fronts[self._runs[k].start].name for k in which]
-        return build_mitsuba_scene([shapes[k] for k in which], names)
+        return TracedScene(build_mitsuba_scene([shapes[k] for k in which], names))
 
     @property
     def passes_straight(self) -> bool:

@@ -33,15 +33,3 @@ class ShapeTable:
     def gather(self, shape: mi.ShapePtr, active: mi.Mask) -> mi.UInt32:
         """The shapes' numbers; 0 where not ``active``."""
         return dr.gather(mi.UInt32, self._table, dr.reinterpret_array(mi.UInt32, shape), active)
-
-
-def first_triangles(scene: mi.Scene) -> ShapeTable:
-    """Where the triangles of each shape begin among those of all, shape after shape.
-
-    Parameters
-    ----------
-    scene : mi.Scene
-        Of meshes.
-    """
-    counts = [shape.face_count() for shape in scene.shapes()]
-    return ShapeTable([scene], np.cumsum([0, *counts[:-1]]))

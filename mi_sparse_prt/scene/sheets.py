@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.ray_offsets import ray_offset
-from mi_sparse_prt.scene.shape_table import first_triangles
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
 
 FEW_RAYS, MANY_RAYS = (
@@ -54,7 +54,7 @@ class Back:
 
 
 def find_backs(
-    scene: mi.Scene,
+    scene: TracedScene,
     meshes: Sequence[TriangleMesh],
     materials: Sequence[Material],
     lamps: NDArray[np.float32] | None = None,
@@ -66,7 +66,7 @@ def find_backs(
 
     Parameters
     ----------
-    scene : mi.Scene
+    scene : TracedScene
         In the normalised frame: the same triangles as those of the meshes, in their order.
     meshes : sequence of TriangleMesh
     materials : sequence of Material
@@ -125,7 +125,7 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
 
 
 def _bright_pieces(
-    scene: mi.Scene,
+    scene: TracedScene,
     meshes: Sequence[TriangleMesh],
     pieces: Ids,
     passing: NDArray[np.bool_],
@@ -160,7 +160,7 @@ class _Looks:
 
     Parameters
     ----------
-    scene : mi.Scene
+    scene : TracedScene
         In the normalised frame.
     meshes : sequence of TriangleMesh
         In any frame; normals count.
@@ -171,10 +171,9 @@ class _Looks:
     """
 
     def __init__(
-        self, scene: mi.Scene, meshes: Sequence[TriangleMesh], pieces: Ids, passing: NDArray[np.bool_]
+        self, scene: TracedScene, meshes: Sequence[TriangleMesh], pieces: Ids, passing: NDArray[np.bool_]
     ) -> None:
         self._scene, self._pieces, self._passing = scene, pieces, passing
-        self._first = first_triangles(scene)
         corners = np.concatenate(
             [
                 np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[
@@ -222,7 +221,7 @@ class _Looks:
         """
         hit = self._scene.ray_intersect_preliminary(ray)
         met = hit.is_valid()
-        index = dr.select(met, self._first.gather(hit.shape, met) + hit.prim_index, 0)
+        index = dr.select(met, self._scene.triangle(hit, met), 0)
         # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
         behind = met & (dr.dot(dr.gather(mi.Vector3f, self._backwards, index), ray.d) < 0)
         piece = np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)

@@ -264,7 +264,7 @@ class _Samples:
         """Light the surfaces that paths have met from all their texels, by one shadow ray each."""
         solver, texels = self.solver, self.solver._texels
         n, n_paths = solver.lighting.n_directions, solver.paths_per_sample
-        si = hit.compute_surface_interaction(paths.ray)
+        si = solver.scene.interaction(hit, paths.ray)
         bsdf, context = si.bsdf(), mi.BSDFContext()
         factor = mi.UInt64(dr.gather(mi.UInt32, self.factor, paths.row))
         step = mi.UInt32(factor * n_paths % n)
@@ -296,7 +296,7 @@ class _Samples:
 
         Russian roulette begins at the first surface: shadow rays then go where they count.
         """
-        si = hit.compute_surface_interaction(paths.ray)
+        si = self.solver.scene.interaction(hit, paths.ray)
         sample, weight = si.bsdf().sample(
             mi.BSDFContext(), si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         )

@@ -19,6 +19,7 @@ from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.operators.mean_cosine import FIXED_POINT
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.problem import Problem
 
 Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
@@ -315,7 +316,7 @@ class DirectSolver:
 
 @dr.syntax
 def pass_straight(
-    scene: mi.Scene,
+    scene: mi.Scene | TracedScene,
     ray: mi.Ray3f,
     active: mi.Mask,
     most: mi.UInt32,
@@ -326,7 +327,7 @@ def pass_straight(
 
     Parameters
     ----------
-    scene : mi.Scene
+    scene : mi.Scene or TracedScene
     ray : Ray3f
         May end somewhere.
     active : Mask
@@ -350,11 +351,10 @@ def pass_straight(
     share, count, boundary = measure(mi.Color3f(1)), mi.UInt32(0), mi.Mask(False)
     ray, active = mi.Ray3f(ray), mi.Mask(active)
     while active:
-        hit = scene.ray_intersect_preliminary(ray, active=active)
-        active &= hit.is_valid()
-        flags = hit.shape.bsdf().flags()
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        flags = si.bsdf().flags()
         through = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (count < most)
-        si = hit.compute_surface_interaction(ray, active=through)
         passed = measure(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
         share = dr.select(active, dr.select(through, share * passed, 0), share)
         count += dr.select(through, 1, 0)

@@ -25,7 +25,6 @@ from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.scene.shape_table import first_triangles
 
 LANES = 1 << 23  # rays per wavefront
 NOTHING = int(
@@ -125,7 +124,6 @@ class Surfaces:
         self._scene, self._passes_straight = scene.normalised, scene.passes_straight
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
         self.n_vertices = scene.n_vertices
-        self._first_triangle = first_triangles(self._scene)
         self._triangles = mi.UInt32(triangles.astype(np.uint32).ravel())
         self._normals = mi.Vector3f(scene.normals.T)
         self._hidden = hidden_corners(scene)
@@ -219,7 +217,7 @@ class Surfaces:
         active: mi.Mask,
     ) -> mi.Ray3f:
         """Cosine-distributed rays from vertices or, of other lanes, from where rays hit."""
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        si = self._scene.interaction(hit, ray, active)
         there = active & of_vertex
         normal = dr.select(
             of_vertex,
@@ -239,12 +237,11 @@ class Surfaces:
         """
         valid = hit.is_valid()
         if self._passes_straight:
-            si = hit.compute_surface_interaction(ray, active=valid)
+            si = self._scene.interaction(hit, ray, valid)
             passed = dr.sum(mi.Color3f(si.bsdf().eval_null_transmission(si, valid))) / 3
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
-        first = self._first_triangle.gather(hit.shape, valid)
-        triangle = first + hit.prim_index
+        triangle = self._scene.triangle(hit, valid)
         corners = [dr.gather(mi.UInt32, self._triangles, 3 * triangle + k, valid) for k in range(3)]
         b = hit.prim_uv.x, hit.prim_uv.y
         weights = 1 - b[0] - b[1], *b

@@ -21,6 +21,7 @@ from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.materials import is_one_of
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # paths per wavefront, about half a second each
@@ -219,14 +220,14 @@ def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any]
     return lambda si, rng: (direction, irradiance, None, mi.Float(0))
 
 
-def has_mirrors(scene: mi.Scene) -> bool:
+def has_mirrors(scene: mi.Scene | TracedScene) -> bool:
     """Whether any surface scatters into single directions."""
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Delta) for shape in scene.shapes())
 
 
 @dr.syntax
 def trace_reflected(
-    scene: mi.Scene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
+    scene: mi.Scene | TracedScene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
 ) -> mi.Color3f:
     """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
 

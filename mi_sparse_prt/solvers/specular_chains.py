@@ -279,7 +279,7 @@ class SpecularChains:
             ends = alive & (texel != NOTHING) & (dr.max(weight) > 0)
             column = dr.select(ends, (met - 1) * size + texel, column)
             brought = dr.select(ends, weight, brought)
-            si = hit.compute_surface_interaction(ray, active=alive & hit.is_valid())
+            si = self._scene.unsplit.interaction(hit, ray, alive)
             goes_on, ray, weight, null = self._sent_on(si, weight, rng, alive & (met < longest))
             return ray, rng, weight, straight & null, met + 1, column, brought, goes_on
 
@@ -321,7 +321,7 @@ class SpecularChains:
         hit = scene.ray_intersect_preliminary(ray)
         weight, straight = dr.full(mi.Color3f, 1, len(index)), dr.full(mi.Mask, True, len(index))
         for _ in range(self._longest):
-            si = hit.compute_surface_interaction(ray, active=hit.is_valid())
+            si = scene.interaction(hit, ray)
             if to_light and self._asks:
                 yield self._of_lamps_asked(si, of, weight, rng)
             goes_on, ray, weight, null = self._sent_on(si, weight, rng, mi.Mask(True))
@@ -363,7 +363,7 @@ class SpecularChains:
             texel = texel_at(*face_coordinates(ray.d), self._problem.emission.resolution)
             return dr.select(active & ~hit.is_valid(), texel, NOTHING), mi.Color3f(1)
         lamp, radiance = lamp_met(
-            self._problem, hit.compute_surface_interaction(ray, active=active), ray, active
+            self._problem, self._scene.unsplit.interaction(hit, ray, active), ray, active
         )
         return dr.select(lamp >= 0, mi.UInt32(lamp), NOTHING), radiance
 

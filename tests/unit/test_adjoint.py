@@ -216,7 +216,7 @@ def test_values_that_are_not_finite_are_refused():
     scene = build(**still_life())
     ids = np.arange(scene.n_vertices)
     whole = solver(scene, channels=1).rows(ids).mean
-    parameters = mi.traverse(scene.normalised)
+    parameters = mi.traverse(scene.normalised.mitsuba)
     (name,) = (k for k in parameters.keys() if "ball" in k and k.endswith("reflectance.value"))
     parameters[name] = mi.Color3f(float("nan"))
     parameters.update()

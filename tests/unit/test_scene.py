@@ -210,8 +210,8 @@ def test_sensors_emitters_and_integrator_are_the_originals(tmp_path: Path) -> No
     assert all(any(a is b for b in free) for a in scene.mitsuba.sensors())
     assert len(scene.mitsuba.emitters()) == 2
     assert all(any(a is b for b in original.emitters()) for a in scene.mitsuba.emitters())
-    assert scene.normalised.emitters() == []
-    assert scene.normalised.sensors() == []
+    assert scene.normalised.mitsuba.emitters() == []
+    assert scene.normalised.mitsuba.sensors() == []
     mi.render(scene.mitsuba, spp=1)
 
 
@@ -221,7 +221,7 @@ def test_area_emitters_are_copied_to_the_world_scene_only() -> None:
     with pytest.warns(PrtWarning, match="'lamp' is an area emitter: matrices of lamps"):
         scene = Scene.from_mitsuba(original, INF)
     assert len(scene.warnings) == 1
-    assert scene.normalised.emitters() == []
+    assert scene.normalised.mitsuba.emitters() == []
     (copy,) = scene.mitsuba.emitters()
     assert copy is not original.emitters()[0]  # an area emitter belongs to one shape
     si = corner_interactions(scene)[0]
@@ -395,7 +395,7 @@ def test_normalised_copy_is_the_unit_box() -> None:
     low, high = scene.normalised_positions.min(axis=0), scene.normalised_positions.max(axis=0)
     np.testing.assert_allclose(low + high, 0, atol=1e-6)
     assert np.max(high - low) == pytest.approx(1, abs=1e-6)
-    box = scene.normalised.bbox()
+    box = scene.normalised.mitsuba.bbox()
     np.testing.assert_allclose(np.array([box.min, box.max]).reshape(2, 3), [low, high], atol=1e-7)
     assert scene.centre.dtype == np.float64
     world = scene.positions.astype(np.float64)
