@@ -167,7 +167,10 @@ class SparsePRT(mi.SamplingIntegrator):
         relit = self._relit(surfaces, scene.environment(), lamps)
         depth = self._settings["max_depth"]
         if lamps:
-            return LampLitIntegrator(relit, scene, depth, self._hide_emitters)
+            # shapes as they are, but for copies: rays that meet instances take long
+            copies = any(shape.class_name() == "Instance" for shape in scene.shapes())
+            lit = surfaces.mitsuba if copies else scene
+            return LampLitIntegrator(relit, lit, depth, self._hide_emitters)
         return RelitIntegrator(relit[0], self._hide_emitters)
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:

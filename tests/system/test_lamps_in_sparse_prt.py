@@ -66,6 +66,19 @@ MIRROR_AND_GLASS = """
     <shape type="sphere" id="glass"><bsdf type="dielectric"/>
         <point name="center" x="0.6" y="-0.7" z="0.6"/><float name="radius" value="0.25"/></shape>"""
 
+COPIES = """
+    <shape type="shapegroup" id="pair">
+        <shape type="cube"><ref id="red"/><transform name="to_world"><scale value="0.12"/></transform></shape>
+        <shape type="sphere"><ref id="white"/>
+            <point name="center" x="0" y="0.22" z="0"/><float name="radius" value="0.1"/></shape>
+    </shape>""" + "".join(
+    f"""
+    <shape type="instance"><ref id="pair"/>
+        <transform name="to_world"><rotate y="1" angle="{30 * x}"/>
+            <translate x="{x}" y="-0.87" z="{z}"/></transform></shape>"""
+    for x, z in ((-0.6, 0.1), (-0.4, 0.6), (0.6, 0.5))
+)
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -157,6 +170,19 @@ def test_a_room_with_all_kinds_of_light(folder, artefact):
     between vertices 0.12 apart.
     """
     bias, error, distance = beside_path(load(folder, PLAIN + BULB + SKY), 4, artefact, 128)
+    assert error < 0.003
+    assert abs(bias) < 0.01
+    assert distance < 0.03
+
+
+@pytest.mark.parametrize("sky", [SKY, ""], ids=["sky", "none"])
+def test_instances_under_lamps(folder, artefact, sky):
+    """Rationale: scenes made of a scene's shapes, for its lamps alone, cannot have instances without their groups.
+
+    Expected: copies of a group under a panel, with and without a sky, as `path` shows them, in the bounds of a room
+        without copies.
+    """
+    bias, error, distance = beside_path(load(folder, COPIES + PLAIN + sky), 4, artefact)
     assert error < 0.003
     assert abs(bias) < 0.01
     assert distance < 0.03
