@@ -29,16 +29,15 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
-from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted, noise_that_does_not_matter
+from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
+from mi_sparse_prt.planner.specular_steps import SpecularSteps
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
 from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import specular_light
-from mi_sparse_prt.solvers.specular_terms import with_term_rows
 from mi_sparse_prt.transport import LightTransport
 
 FACTOR_SHARE = 0.5  # of the target error, which the factors of BRDFs may have; a quarter of its square
@@ -180,21 +179,16 @@ class _Attempts:
         self._direct, self._problem, self._settings, self._run = direct, direct.problem, settings, run
         self._dark = _no_indirect(direct.problem, settings, run.clock)
         settings, costs = _measured(direct, settings, self._dark is None, run.clock)
-        specular = None
+        self._specular = None
         if self._dark is None and self._problem.specular_apart:
-            options = settings.specular
-            if costs is not None:
-                noise = noise_that_does_not_matter(costs, settings.target_error, settings.max_seconds)
-                options = replace(options, error=max(options.error, noise))
             with run.clock.phase("specular"):
-                specular = specular_light(self._problem, run.seed, options)
-                if self._problem.reflection.terms:
-                    specular = with_term_rows(self._problem, specular, run.seed)
-            if costs is not None and specular.seen is not None:
+                self._specular = SpecularSteps(self._problem, settings, run.seed)
+            if costs is not None and self._specular.seen is not None:
                 known = {how: cost.with_known_centres for how, cost in costs.direct.items()}
                 costs = replace(costs, direct=known)
-        self._proposals = _proposals(settings, costs, 0.0 if specular is None else specular.error, run.clock)
-        self._execution = Execution(direct, settings, self._dark is None, run, specular)
+        noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.light)
+        self._proposals = _proposals(settings, costs, noise, run.clock)
+        self._execution = Execution(direct, settings, self._dark is None, run, light)
 
     def matrix(self) -> LightTransport:
         """The matrix of the last attempt, with its report."""
@@ -228,14 +222,11 @@ class _Attempts:
 
     def _direct_light(self) -> list[MethodResult]:
         """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
-        proposals, problem = self._proposals, self._problem
+        proposals = self._proposals
         if isinstance(proposals, RefinementSchedule) or (how := proposals.uncertain) is None:
             return []
         parts = self._execution.direct_light(how)
-        with self._run.clock.phase("held_out"):
-            stream = random_stream(self._run.seed, DECISION, 0)
-            found = held_out_error(problem, matrix_of(problem, parts), stream, indirect=False)
-        proposals.choose_again(how, found.total)
+        proposals.choose_again(how, self._judged(parts, 0, None, indirect=False).total)
         return [parts]
 
     def _evaluated(self, before: list[MethodResult]) -> tuple[MethodResult, Plan]:
@@ -246,13 +237,13 @@ class _Attempts:
         """
         proposals, target, attempts = self._proposals, self._settings.target_error, list(before)
         attempts.append(self._execution.parts(proposals.plan))
-        plans, errors = [proposals.plan] * len(attempts), [math.inf] * len(before)
-        while target is not None:
-            with self._run.clock.phase("held_out"):
-                transport = matrix_of(self._problem, attempts[-1])
-                stream = random_stream(self._run.seed, DECISION, len(attempts))
-                found = held_out_error(self._problem, transport, stream, target, indirect=self._dark is None)
-            errors.append(found.total)
+        plans = [proposals.plan] * len(attempts)
+        if target is None:
+            return self._finished(attempts, -1), plans[-1]
+        judged: list[HeldOutError | None] = [None] * len(before)
+        while True:
+            found = self._judged(attempts[-1], len(attempts), target)
+            judged.append(found)
             if found.total <= target or found.dark:
                 break
             of_rays = attempts[-1].radiosity.get("error_of_rays", math.inf)
@@ -262,8 +253,32 @@ class _Attempts:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))
             attempts.append(self._execution.parts(proposals.plan))
             plans.append(proposals.plan)
-        best = int(np.argmin(errors)) if target is not None else -1
-        return _with_costs_of(attempts, best), plans[best]
+        best = int(np.argmin([math.inf if found is None else found.total for found in judged]))
+        return self._finished(attempts, best, judged[best]), plans[best]
+
+    def _judged(
+        self, parts: MethodResult, attempt: int, target: float | None, indirect: bool = True
+    ) -> HeldOutError:
+        """The error of an attempt, by elements of its own, with as little noise of specular light as there will be."""
+        indirect = indirect and self._dark is None
+        with self._run.clock.phase("held_out"):
+            stream = random_stream(self._run.seed, DECISION, attempt)
+            transport = matrix_of(self._problem, parts)
+            found = held_out_error(self._problem, transport, stream, target, indirect=indirect)
+        return found if self._specular is None else self._specular.foreseen(found)
+
+    def _finished(
+        self, attempts: list[MethodResult], which: int, found: HeldOutError | None = None
+    ) -> MethodResult:
+        """One of the attempts, with as many rays of specular light as are worth it beside its error."""
+        parts = _with_costs_of(attempts, which)
+        if self._specular is None or self._specular.done:
+            return parts
+        found = found or self._judged(parts, len(attempts), TARGET)
+        with self._run.clock.phase("specular"):
+            self._specular.refine(found)
+            light = self._specular.light
+        return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 
 
 def _of_scene(measurement: Measurement, scene: Scene) -> Measurement:

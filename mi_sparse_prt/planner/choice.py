@@ -140,16 +140,6 @@ def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[_Priced]:
             yield _Priced(plan, costs.sparse.seconds(share), 0.0, costs.sparse.error(share))
 
 
-def noise_that_does_not_matter(costs: Costs, target: float | None, most_seconds: float) -> float:
-    """Error of specular light beside which that of the most exact plan is as large as it was, within 10%.
-
-    0 unless all plans of at most so many seconds miss the target, were they twice as exact as predicted.
-    """
-    aim = target or TARGET
-    least = min((p.error for p in predictions(costs, aim) if p.seconds <= most_seconds), default=0.0)
-    return least * math.sqrt(MINIMUM_GAIN**-2 - 1) if least > WORST_FACTOR * aim else 0.0
-
-
 def choose(plans: list[Predicted], target: float | None) -> Predicted:
     """Of the plans that meet a target, the one that is expected to take the least time.
 

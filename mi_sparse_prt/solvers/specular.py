@@ -148,29 +148,90 @@ def specular_light(
     ids : (n,) integers, optional
         Points; all if not given.
     """
-    every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
-    seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 64)]
-    power = np.square(problem.reflection.albedo[every].astype(np.float64))
-    passes = problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting)
-    parts = int(problem.scene.bends_light) + int(passes)
-    share = options.error**2 / max(parts, 1)
-    direct = _direct_norm(problem, every, power, seeds[-1])
-    limit = _Limit(share, share * direct)
-    found, seen = [], None
-    if problem.scene.bends_light:
-        found.append(_Arriving(problem, every, power, seeds[:32]).refined(options, limit))
-    if passes:
-        passing = _Passing(problem, every, power, seeds[32:])
-        found.append(passing.refined(options, limit))
-        seen = passing.seen
-    halves = [half for estimate in found for half in estimate.halves]
-    mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
-    grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
-    matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
-    square, noise = sum(part.square for part in found), sum(part.noise for part in found)
-    rays = sum(part.rays for part in found)
-    own, all_of_it = (float(np.sqrt(noise / max(norm, 1e-300))) for norm in (square, square + direct))
-    return SpecularLight(matrices, problem.depths_apart, own, all_of_it, rays, seen)
+    search = SpecularSearch(problem, seed, options, ids)
+    search.refine(options.error)
+    return search.light()
+
+
+class SpecularSearch:
+    """Looks for specular light with more and more rays, see ``specular_light``; ``options.error`` plays no part.
+
+    Attributes
+    ----------
+    seen : (n, words) uint32 bits or None
+        As of ``SpecularLight``.
+    """
+
+    def __init__(self, problem: Problem, seed: int, options: SpecularOptions, ids: Ids | None = None) -> None:
+        every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
+        seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 128)]
+        power = np.square(problem.reflection.albedo[every].astype(np.float64))
+        self._direct, self._depths = _direct_norm(problem, every, power, seeds[-1]), problem.depths_apart
+        self._parts, self.seen = [], None
+        if problem.scene.bends_light:
+            self._parts.append(_Arriving(problem, every, power, seeds[:32]).estimated(options))
+        if problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting):
+            passing = _Passing(problem, every, power, seeds[32:-1])
+            self._parts.append(passing.estimated(options))
+            self.seen = passing.seen
+
+    @property
+    def error(self) -> float:
+        """As of ``SpecularLight``, of what was found so far."""
+        return self._relative(sum(part.total.square for part in self._parts) + self._direct)
+
+    def _relative(self, square: float) -> float:
+        return float(np.sqrt(sum(part.total.noise for part in self._parts) / max(square, 1e-300)))
+
+    def refine(self, error: float) -> None:
+        """Trace more rays until about so much noise is left, if it is more: relative L2, as ``error`` is."""
+        share = error**2 / max(len(self._parts), 1)
+        for part in self._parts:
+            part.refine(_Limit(share, share * self._direct))
+
+    def light(self) -> SpecularLight:
+        """What was found so far."""
+        halves = [half for part in self._parts for half in part.total.halves]
+        mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
+        grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
+        matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
+        noise = self._relative(sum(part.total.square for part in self._parts))
+        rays = sum(part.total.rays for part in self._parts)
+        return SpecularLight(matrices, self._depths, noise, self.error, rays, self.seen)
+
+
+class _Mean:
+    """The mean of estimates; each counts by how little noise it has.
+
+    Where rays of a later one go depends on those before it, what they find on average does not.
+
+    Parameters
+    ----------
+    total : _Estimate
+        The first.
+    sample : callable, optional
+        Another estimate, of as much squared noise as it is asked for, about, and whether it is as fine as can be; None
+        if the first is.
+    """
+
+    def __init__(
+        self, total: _Estimate, sample: Callable[[float], tuple[_Estimate, bool]] | None = None
+    ) -> None:
+        self.total, self._sample = total, sample
+        self._trust, self._enough = 1.0, 1.0
+
+    def refine(self, limit: _Limit) -> None:
+        """Add estimates until the noise is small enough."""
+        for _ in range(ROUNDS):
+            bound = limit.of(self.total.square)
+            if self._sample is None or self.total.noise <= self._enough * bound:
+                break
+            wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / self.total.noise) / CAUTION
+            found, finest = self._sample(wanted * self._trust)
+            self._trust *= min(wanted / max(found.noise, 1e-300), 1)
+            self.total, self._enough = _mean_of(self.total, found), ENOUGH
+            if finest:
+                self._sample = None
 
 
 class _Arriving:
@@ -181,7 +242,7 @@ class _Arriving:
         self._size = problem.emission.size * max(problem.depths_apart, 1)
         self._cells = self._chains.find_cells(ids, next(self._seeds))
 
-    def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
+    def estimated(self, options: SpecularOptions) -> _Mean:
         """As many strata as the noise asks for; the first ones say where light comes from.
 
         Rays are best in proportion to what they spread by; first, that is the share of light that surfaces send on.
@@ -189,7 +250,7 @@ class _Arriving:
         found = len(self._ids) * CELLS**2
         if options.first >= options.last:
             only, _ = self._sampled(np.full(len(self._cells.rows), options.first))
-            return only._replace(rays=found + only.rays)
+            return _Mean(only._replace(rays=found + only.rays))
         across = np.rint(options.first * np.sqrt(self._cells.shares))
         strata = np.clip(across, 1, options.first).astype(np.int64)
         first, squares = self._sampled(strata)
@@ -205,7 +266,7 @@ class _Arriving:
             strata = np.clip(across, 1, options.last).astype(np.int64)
             return self._sampled(strata)[0], bool((strata == options.last).all())
 
-        return _until_good(first, sample, limit)
+        return _Mean(first, sample)
 
     def _sampled(self, strata: NDArray[np.int64]) -> tuple[_Estimate, NDArray[np.float64]]:
         """Light from rays into cells, twice; and the squared weights of rays of each cell, summed."""
@@ -260,7 +321,7 @@ class _Passing:
         self._rays = len(ids) * problem.emission.size * (strata**2 if self.seen is None else 1)
         self._rows, self._texels = _with_neighbours(self._found, problem)
 
-    def refined(self, options: SpecularOptions, limit: _Limit) -> _Estimate:
+    def estimated(self, options: SpecularOptions) -> _Mean:
         """As many strata in each texel as the noise asks for; none is random in the direction basis.
 
         Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
@@ -268,11 +329,11 @@ class _Passing:
         averaged with those of its neighbours.
         """
         if self._problem.basis == "direction":
-            return _compared([[self._found] * 3] * 2, self._power, self._rays)
+            return _Mean(_compared([[self._found] * 3] * 2, self._power, self._rays))
         strata = np.full(len(self._rows), options.strata)
         first, squares = self._sampled(strata)
         if not len(strata) or options.strata >= STRATA[-1]:
-            return first
+            return _Mean(first)
         law = self._averaged(squares) * options.strata**3
         between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
 
@@ -281,7 +342,7 @@ class _Passing:
             strata = np.array(STRATA)[np.searchsorted(between, scale * law**0.2)]
             return self._sampled(strata)[0], bool((strata == STRATA[-1]).all())
 
-        return _until_good(first, sample, limit)
+        return _Mean(first, sample)
 
     def _averaged(self, squares: Doubles) -> Doubles:
         """Squared noise of each element, averaged with its neighbours on the cubemap and one average element."""
@@ -339,32 +400,6 @@ def _beside(problem: Problem) -> Sparse:
     ones = np.ones(beside.size + len(beside), np.float32)
     near = np.append(texel, np.arange(len(beside))), np.append(beside.ravel(), np.arange(len(beside)))
     return scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2).tocsr()
-
-
-def _until_good(
-    first: _Estimate, sample: Callable[[float], tuple[_Estimate, bool]], limit: _Limit
-) -> _Estimate:
-    """The mean of estimates, one more until the noise is small enough; each counts by how little noise it has.
-
-    Where rays of a later one go depends on those before it, what they find on average does not.
-
-    Parameters
-    ----------
-    first : _Estimate
-    sample : callable
-        Another estimate, of as much squared noise as it is asked for, about, and whether it is as fine as can be.
-    limit : _Limit
-    """
-    total, trust, finest = first, 1.0, False
-    for _ in range(ROUNDS):
-        bound = limit.of(total.square)
-        if total.noise <= (bound if total is first else ENOUGH * bound) or finest:
-            break
-        wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / total.noise) / CAUTION
-        found, finest = sample(wanted * trust)
-        trust *= min(wanted / max(found.noise, 1e-300), 1)
-        total = _mean_of(total, found)
-    return total
 
 
 def _mean_of(a: _Estimate, b: _Estimate) -> _Estimate:

@@ -39,8 +39,32 @@ class _Light(NamedTuple):
     light: Floats
 
 
-def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> SpecularLight:
-    """Specular light with rows for the terms of glossy vertices, after those of all vertices.
+class TermRows(NamedTuple):
+    """Specular light of the terms of glossy vertices.
+
+    Attributes
+    ----------
+    matrices : three (glossy vertices * K, k * n_directions) sparse float32
+        Of the channels; columns are those of ``SpecularLight.matrices``.
+    rays : int
+        That were traced.
+    """
+
+    matrices: list[Sparse]
+    rays: int
+
+    def after(self, specular: SpecularLight) -> SpecularLight:
+        """Specular light with these rows after those of all vertices."""
+        known = specular.matrices
+        matrices = tuple(
+            scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
+            for c, terms in enumerate(self.matrices)
+        )
+        return replace(specular, matrices=matrices, rays=specular.rays + self.rays)
+
+
+def term_rows(problem: Problem, seed: int) -> TermRows:
+    """Specular light as the terms of glossy vertices receive it.
 
     Light by way of mirrors and glass is weighted by incident factors in the direction of each ray, and is noisier than
     that of unit-albedo rows; light that comes straight through, in the direction of its texel's centre.
@@ -49,8 +73,6 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     ----------
     problem : Problem
         With in-out factors, at the vertices of its scene.
-    specular : SpecularLight
-        Of unit-albedo rows.
     seed : int
     """
     reflection = problem.reflection
@@ -58,8 +80,7 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     ids, lobes = reflection.glossy, Lobes(reflection)
     (bent_seed,) = element_seeds(random_stream(seed, SPECULAR, 1), 1)
     chains = _TermChains(problem)
-    known = specular.matrices
-    shape = len(ids) * reflection.terms, known[0].shape[1]
+    shape = len(ids) * reflection.terms, problem.emission.size * max(problem.depths_apart, 1)
     sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
     parts = [chains.bent(ids, lobes, bent_seed)] if problem.scene.bends_light else []
     if problem.scene.passes_straight:
@@ -67,11 +88,7 @@ def with_term_rows(problem: Problem, specular: SpecularLight, seed: int) -> Spec
     for part in parts:
         for found in part:
             sums = [a + b for a, b in zip(sums, _rows_of_terms(found, shape), strict=True)]
-    matrices = tuple(
-        scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
-        for c, terms in enumerate(sums)
-    )
-    return replace(specular, matrices=matrices, rays=specular.rays + chains.traced)
+    return TermRows(sums, chains.traced)
 
 
 class _TermChains(SpecularChains):

@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -28,7 +29,6 @@ from mi_sparse_prt.planner.choice import (
     choose_first,
     finer,
     learned,
-    noise_that_does_not_matter,
     predictions,
     uncertain,
     with_direct,
@@ -38,6 +38,7 @@ from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
+from mi_sparse_prt.planner.specular_steps import SpecularSteps
 from mi_sparse_prt.precompute import _warn_if_missed
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
@@ -585,15 +586,44 @@ def test_what_one_kind_of_direct_light_turns_out_to_be_tells_of_others():
     assert after["exact"] == kinds["exact"]
 
 
-def test_specular_light_is_as_exact_as_what_is_beside_it():
+def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     """
-    Scenario: gathering ends at 30 or at 9%, for a target of 5%; paths would meet it in days.
-    Expected: beside 30%, noise of 14.5%, as the root of 1 / 0.81 - 1 has it; beside 9%, which may be half of it,
-        and where as many hours are allowed as paths take, none but what the target allows.
+    Scenario: the first rays find light of which 20% is noise; at the end other errors are known.
+    Expected: four times the noise that is aimed at does for sources. The matrix is judged as with the noise that is
+        aimed at. In the end there is as much as makes the error a tenth larger (the root of 1 / 0.81 - 1 of it) or as
+        reaches 95% of the target, and never less than what is aimed at.
     """
-    for bias, hours, noise in ((0.3, 0.05, 0.145), (0.09, 0.05, 0.0), (0.3, 1e3, 0.0)):
-        costs = Costs(0, EXACT, PathCosts({32: 1e3}, {32: 0.6}, {32: 0.0}), BiasedGather(bias))
-        assert noise_that_does_not_matter(costs, 0.05, 3600 * hours) == pytest.approx(noise, rel=0.02)
+    asked = []
+
+    class Search:
+        error, seen = 0.2, None
+
+        def __init__(self, *_: object) -> None: ...
+
+        def refine(self, error: float) -> None:
+            asked.append(error)
+
+    module = importlib.import_module("mi_sparse_prt.planner.specular_steps")
+    monkeypatch.setattr(module, "SpecularSearch", Search)
+    problem = SimpleNamespace(reflection=SimpleNamespace(terms=0))
+    cases = (
+        (0.05, 0.3, 0.1453),
+        (0.05, 0.01, 0.0464),
+        (0.05, 0.045, 0.0354),
+        (None, 0.07, 0.0339),
+        (None, 0.001, 0.0141),
+    )
+    for target, others, least in cases:
+        asked.clear()
+        steps = SpecularSteps(problem, Settings(8, target_error=target), 0)
+        aim = (target or 0.02) / math.sqrt(2)
+        assert steps.error == pytest.approx(aim) and not steps.done
+        parts = {"direct": 0.0, "indirect": others, "specular": 0.18}
+        found = steps.foreseen(HeldOutError(math.hypot(others, 0.18), {}, {"total": 0.0}, 100, parts, []))
+        assert found.parts["specular"] == pytest.approx(0.9 * aim)
+        assert found.total == pytest.approx(math.hypot(others, 0.9 * aim))
+        steps.refine(found)
+        assert asked == pytest.approx([4 * aim, least], rel=0.01)
 
 
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
