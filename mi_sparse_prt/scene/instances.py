@@ -18,6 +18,7 @@ from mi_sparse_prt.scene.mesh_cleaning import flip_sides
 from mi_sparse_prt.scene.traversal import children
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, concatenated, normalise_rows
 
+MERGED = " + "  # between the names of meshes that Mitsuba has merged into one
 MANY = 100  # instances: the time for a kernel grows as their square, a tenth of a second for so many, ten for 1000
 
 
@@ -181,9 +182,10 @@ def _instances(scene: mi.Scene) -> list[tuple[mi.Shape, NDArray[np.float64]]]:
 
 
 def _name(shape: mi.Shape, k: int) -> str:
-    """Its id, else the name of its file, else its type and number."""
-    name = shape.id()
+    """Its id, else the name of its file, else its type and number; the first of several that Mitsuba has merged."""
+    name, *others = shape.id().split(MERGED)
     if not name or name.startswith("_"):
         file = re.search(r'name = "([^"]+)"', str(shape)) if shape.is_mesh() else None
-        name = Path(file.group(1)).stem if file else f"{shape.class_name().lower()}_{k}"
-    return str(name)
+        first, *others = (file.group(1) if file else "").split(MERGED)
+        name = Path(first.strip()).stem or f"{shape.class_name().lower()}_{k}"
+    return f"{name} and {len(others)} more" if others else name

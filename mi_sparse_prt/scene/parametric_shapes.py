@@ -14,6 +14,8 @@ from mi_sparse_prt.scene.mesh_cleaning import flip_sides
 from mi_sparse_prt.scene.subdivision import TIE, too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals, unique_rows
 
+FEWEST = 32  # segments around a shape, whatever the edge length
+
 #: (u, v) of shape (n,) each -> local positions and local normals, (n, 3) each.
 Parametrisation = Callable[
     [NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -44,6 +46,7 @@ def parametric_mesh(
     name: str,
     *,
     limit: int,
+    fewest: int = FEWEST,
     flip: bool = False,
     weld: bool = False,
 ) -> TriangleMesh:
@@ -58,6 +61,8 @@ def parametric_mesh(
         World units; grid lines are at most this far apart. `inf` gives the coarsest grid.
     limit : int
         The largest number of vertices allowed.
+    fewest : int
+        Segments around, whatever the edge length: a multiple of 4.
     flip : bool
         Normals point inwards, or, on a disk, along its local -z.
     weld : bool
@@ -86,7 +91,7 @@ def parametric_mesh(
             f"shape '{name}': the to_world of a {shape} must not shear it or scale it unevenly: "
             "use a mesh instead"
         )
-    radius, fewest = max(scale[0], scale[1]), 32  # segments around, whatever the edge length
+    radius = max(scale[0], scale[1])
     around = 4 * max(fewest // 4, _segments(np.pi / 2 * radius, edge_length))
     # `angle` is the axis of (u, v) that runs around, `across` counts along the other one, `poles` are its ends
     # where circles shrink to points.

@@ -29,9 +29,12 @@ from mi_sparse_prt.scene.mesh_cleaning import (
 )
 from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
 from mi_sparse_prt.scene.notes import Fact, Notes, about
-from mi_sparse_prt.scene.parametric_shapes import parametric_mesh
+from mi_sparse_prt.scene.parametric_shapes import FEWEST, parametric_mesh
 from mi_sparse_prt.scene.subdivision import subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
+
+ALL_ROUND = 64  # spheres, disks and cylinders of as many segments as one has: 35,000 vertices
+LEAST_AROUND = 12  # of many: seen from the side, they lack 3% of their radius
 
 _BECOME_TRIANGLES = {"Sphere", "Disk", "Cylinder", "BSplineCurve", "LinearCurve", "Ellipsoids"}
 
@@ -96,10 +99,10 @@ def read_surfaces(
         edge_length = _diagonal(placed, clean) / 64
 
     surfaces: list[tuple[TriangleMesh, Material]] = []
-    limit = most_vertices
+    limit, fewest = most_vertices, _segments_around(placed)
     for where, mesh, material in zip(placed, clean, materials, strict=True):
         if mesh is None:
-            mesh = where.in_world(_tessellate(where, material, edge_length, limit), limit)
+            mesh = where.in_world(_tessellate(where, material, edge_length, limit, fewest), limit)
         _note_if_inwards(mesh, material, notes)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
@@ -153,7 +156,17 @@ def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> fl
     return float(np.linalg.norm(np.ptp(np.concatenate(points).astype(np.float64), axis=0)))
 
 
-def _tessellate(where: PlacedShape, material: Material, edge_length: float, limit: int) -> TriangleMesh:
+def _segments_around(placed: list[PlacedShape]) -> int:
+    """Segments around round shapes, at least: fewer of each where there are many, which are small then."""
+    count = sum(
+        1 if where.copies is None else len(where.copies) for where in placed if not where.shape.is_mesh()
+    )
+    return max(LEAST_AROUND, 4 * int(FEWEST * min(1.0, np.sqrt(ALL_ROUND / max(count, 1))) // 4))
+
+
+def _tessellate(
+    where: PlacedShape, material: Material, edge_length: float, limit: int, fewest: int
+) -> TriangleMesh:
     """Triangles of a shape that has none, in world space or that of its group."""
     shape, edge_length = where.shape, edge_length / where.largest_scale
     if shape.class_name() in ("BSplineCurve", "LinearCurve"):
@@ -170,6 +183,7 @@ def _tessellate(where: PlacedShape, material: Material, edge_length: float, limi
         edge_length,
         material.name,
         limit=limit,
+        fewest=fewest,
         flip=shape.has_flipped_normals() != mirrored,
         weld=material.constant,
     )

@@ -56,7 +56,7 @@ class Cells(NamedTuple):
     numbers: NDArray[np.int64]
     shares: NDArray[np.float32]
 
-    def take(self, part: slice) -> Cells:
+    def take(self, part: slice | NDArray[np.integer]) -> Cells:
         """Some of them."""
         return Cells(self.rows[part], self.numbers[part], self.shares[part])
 
@@ -154,7 +154,7 @@ class SpecularChains:
         """Sums of few columns, however bright, in the order of rays."""
         sums, squares = np.zeros((3, n * self._size)), np.zeros(len(strata))
         for ends in self._follow(*rays, True):
-            of, column, weight = _kept(ends)
+            of, column, weight = kept_ends(ends)
             share, place = 1 / (CELLS * strata[of].astype(float)) ** 2, rows[of] * self._size + column
             for total, own in zip(sums, weight, strict=True):
                 np.add.at(total, place, own * share)
@@ -185,7 +185,7 @@ class SpecularChains:
         found = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(max(self._apart - 1, 1))]
         for depth, ends in enumerate(self._follow(ray, row, rng, False)):
             if depth + 1 < self._longest:  # light of a surface at the end makes one more bounce
-                of, column, weight = _kept(ends)
+                of, column, weight = kept_ends(ends)
                 mean = (weight.mean(axis=0) / rays).astype(np.float32)
                 found[depth if self._apart else 0] += scipy.sparse.coo_array(
                     (mean, (of, column)), shape=shape
@@ -296,7 +296,7 @@ class SpecularChains:
         )
         *_, column, brought, _ = dr.while_loop(state, lambda *state: state[-1], go_on, mode="symbolic")
         dr.eval(column, brought)
-        return _kept(_Ends(of, column, brought, column != NOTHING))
+        return kept_ends(_Ends(of, column, brought, column != NOTHING))
 
     def _sent_on(
         self, si: mi.SurfaceInteraction3f, weight: mi.Color3f, rng: mi.PCG32, active: mi.Mask
@@ -382,7 +382,7 @@ class SpecularChains:
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
 
 
-def _kept(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Floats]:
+def kept_ends(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Floats]:
     """Numbers (m,), columns and weights (3, m) of rays that are valid."""
     index = dr.compress(ends.valid)
     if len(index) == 0:  # nothing is gathered of nothing

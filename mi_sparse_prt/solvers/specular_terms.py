@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
@@ -12,16 +12,17 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.core.random_keys import element_seeds, mix, random_stream
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SPECULAR, SpecularLight, passed_light
-from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, SpecularChains
+from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Cells, SpecularChains, kept_ends
 
-STRATA = 4  # per axis of a cell of a hemisphere, each with a ray
+STRATA = 4  # per axis of a cell of a hemisphere that sends all light on, each with a ray
+LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
 
 Floats = NDArray[np.float32]
 Sparse: TypeAlias = scipy.sparse.csr_array
@@ -44,8 +45,8 @@ class TermRows(NamedTuple):
 
     Attributes
     ----------
-    matrices : three (glossy vertices * K, k * n_directions) sparse float32
-        Of the channels; columns are those of ``SpecularLight.matrices``.
+    matrices : one or three (glossy vertices * K, k * n_directions) sparse float32
+        Of the channels, or of all of them; columns are those of ``SpecularLight.matrices``.
     rays : int
         That were traced.
     """
@@ -55,11 +56,9 @@ class TermRows(NamedTuple):
 
     def after(self, specular: SpecularLight) -> SpecularLight:
         """Specular light with these rows after those of all vertices."""
-        known = specular.matrices
-        matrices = tuple(
-            scipy.sparse.csr_array(scipy.sparse.vstack([known[min(c, len(known) - 1)], terms], format="csr"))
-            for c, terms in enumerate(self.matrices)
-        )
+        count = max(len(self.matrices), len(specular.matrices))
+        pairs = zip(*(_of_channels(some, count) for some in (specular.matrices, self.matrices)), strict=True)
+        matrices = tuple(scipy.sparse.csr_array(scipy.sparse.vstack(pair, format="csr")) for pair in pairs)
         return replace(specular, matrices=matrices, rays=specular.rays + self.rays)
 
 
@@ -78,17 +77,14 @@ def term_rows(problem: Problem, seed: int) -> TermRows:
     reflection = problem.reflection
     assert isinstance(reflection, InOutFactors)
     ids, lobes = reflection.glossy, Lobes(reflection)
-    (bent_seed,) = element_seeds(random_stream(seed, SPECULAR, 1), 1)
+    bent_seeds = element_seeds(random_stream(seed, SPECULAR, 1), 2)
     chains = _TermChains(problem)
-    shape = len(ids) * reflection.terms, problem.emission.size * max(problem.depths_apart, 1)
-    sums = [scipy.sparse.csr_array(shape, dtype=np.float32) for _ in range(3)]
-    parts = [chains.bent(ids, lobes, bent_seed)] if problem.scene.bends_light else []
+    width = problem.emission.size * max(problem.depths_apart, 1)
+    parts = [chains.bent(ids, lobes, *bent_seeds)] if problem.scene.bends_light else []
     if problem.scene.passes_straight:
         parts.append(_straight(problem, ids, lobes))
-    for part in parts:
-        for found in part:
-            sums = [a + b for a, b in zip(sums, _rows_of_terms(found, shape), strict=True)]
-    return TermRows(sums, chains.traced)
+    found = [_stacked(part, reflection.terms, width) for part in parts]
+    return TermRows(_added(found), chains.traced)
 
 
 class _TermChains(SpecularChains):
@@ -98,38 +94,96 @@ class _TermChains(SpecularChains):
         super().__init__(problem)
         self.traced = 0
 
-    def bent(self, ids: Ids, lobes: Lobes, seed: int) -> Iterator[_Light]:
-        """Light that points receive by way of mirrors and glass, for some rays at a time."""
-        cells = self.find_cells(ids, seed)
-        self.traced += len(ids) * CELLS**2 + len(cells.rows) * STRATA**2
-        step = max(1, LANES // (STRATA**2 * 8))
-        for a in range(0, len(cells.rows), step):
-            some = cells.take(slice(a, a + step))
-            ray, entry, rng = self._rays_into(ids, some, np.full(len(some.rows), STRATA), seed)
-            of_lane = some.rows[entry.numpy()]
-            point = mi.UInt32(np.asarray(ids)[of_lane].astype(np.uint32))
-            into = _weights(lobes, point, ray.d)
-            for depth, ends in enumerate(self._follow(ray, dr.arange(mi.UInt32, len(of_lane)), rng, True)):
-                kept = ends.valid.numpy()
-                lanes, texels, light = (
-                    x[kept] for x in (ends.of.numpy(), ends.column.numpy(), ends.weight.numpy().T)
+    def bent(self, ids: Ids, lobes: Lobes, cells_seed: int, seed: int) -> Iterator[tuple[int, list[_Light]]]:
+        """Light that points receive by way of mirrors and glass, for some points at a time, and how many these are.
+
+        What rays find must not depend on those by which cells were chosen: two seeds.
+        """
+        cells, strata, scale = self._worth_rays(ids, self.find_cells(ids, cells_seed), cells_seed)
+        self.traced += len(ids) * CELLS**2 + int((strata**2).sum())
+        rays = np.concatenate([[0], np.cumsum(strata**2)])
+        starts = np.searchsorted(cells.rows, np.arange(len(ids) + 1))
+        first = 0
+        while first < len(ids):
+            most = int(np.searchsorted(rays[starts], rays[starts[first]] + LANES // 8, side="right")) - 1
+            last = min(max(most, first + 1), len(ids))
+            part = slice(starts[first], starts[last])
+            if part.start < part.stop:
+                some = cells.take(part)._replace(rows=cells.rows[part] - first)
+                yield (
+                    last - first,
+                    list(self._found(ids[first:last], some, strata[part], scale[part], lobes, seed)),
                 )
-                share = light / np.float32((CELLS * STRATA) ** 2)
-                columns = texels.astype(np.int64) + (depth * self._size if self._apart else 0)
-                yield _Light(of_lane[lanes], columns, into[lanes], share)
+            else:
+                yield last - first, []
+            first = last
+
+    def _worth_rays(self, ids: Ids, cells: Cells, seed: int) -> tuple[Cells, NDArray[np.int64], Floats]:
+        """Cells to send rays into, strata per axis of each, and what their light is to be multiplied by.
+
+        Rays are in proportion to the share of light that is sent on; where that is less than one ray, some cells stand
+        for others.
+        """
+        wanted = STRATA**2 * np.clip(cells.shares, LEAST_SHARE, 1)
+        chance = np.minimum(wanted, 1)
+        keys = self._problem.points.keys[np.asarray(ids)[cells.rows]]
+        drawn = mix(mix(keys ^ np.uint64(seed)) ^ cells.numbers.astype(np.uint64)) * 2.0**-64
+        kept = np.flatnonzero(drawn < chance)
+        strata = np.clip(np.rint(np.sqrt(wanted)), 1, STRATA).astype(np.int64)
+        return cells.take(kept), strata[kept], (1 / chance[kept]).astype(np.float32)
+
+    def _found(
+        self, ids: Ids, cells: Cells, strata: NDArray[np.int64], scale: Floats, lobes: Lobes, seed: int
+    ) -> Iterator[_Light]:
+        """Light of rays into cells of some points, after one specular surface, after two, ..."""
+        ray, entry, rng = self._rays_into(ids, cells, strata, seed)
+        of = entry.numpy()
+        of_lane, share = cells.rows[of], scale[of] / np.float32(CELLS * strata[of]) ** 2
+        into = _weights(lobes, mi.UInt32(np.asarray(ids)[of_lane].astype(np.uint32)), ray.d)
+        for depth, ends in enumerate(self._follow(ray, dr.arange(mi.UInt32, len(of)), rng, True)):
+            lanes, texels, light = kept_ends(ends)
+            columns = texels.astype(np.int64) + (depth * self._size if self._apart else 0)
+            yield _Light(of_lane[lanes], columns, into[lanes], light.T * share[lanes, None])
 
 
-def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[_Light]:
+def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[tuple[int, list[_Light]]]:
     """Light that comes straight through surfaces which let a part of it pass."""
-    found = passed_light(DirectSolver(problem), ids).tocoo()
-    step = LANES // 8
-    for a in range(0, found.nnz, step):
-        rows, columns = (x[a : a + step] for x in found.coords)
-        point = mi.UInt32(np.asarray(ids)[rows].astype(np.uint32))
+    found = passed_light(DirectSolver(problem), ids)
+    step = max(1, LANES // 8 // problem.emission.size)
+    for first in range(0, len(ids), step):
+        some = found[first : first + step].tocoo()
+        rows, columns = some.coords
+        point = mi.UInt32(np.asarray(ids)[first + rows].astype(np.uint32))
         texels = columns % problem.emission.size
         towards = mi.Vector3f(np.ascontiguousarray(problem.emission.directions[texels].T))
-        light = np.repeat(found.data[a : a + step, None], 3, axis=1)
-        yield _Light(rows.astype(np.int64), columns.astype(np.int64), _weights(lobes, point, towards), light)
+        light = np.repeat(some.data[:, None], 3, axis=1)
+        yield (
+            some.shape[0],
+            [_Light(rows.astype(np.int64), columns.astype(np.int64), _weights(lobes, point, towards), light)],
+        )
+
+
+def _stacked(found: Iterator[tuple[int, list[_Light]]], terms: int, width: int) -> list[Sparse]:
+    """Matrices (n * K, width) from light of points, some after others: of each channel, or one if all are the same."""
+    blocks = [[scipy.sparse.csr_array((0, width), dtype=np.float32)]]
+    for n, lights in found:
+        none = [scipy.sparse.csr_array((n * terms, width), dtype=np.float32)]
+        blocks.append(_added([none, *(_rows_of_terms(light, none[0].shape) for light in lights)]))
+    count = max(map(len, blocks))
+    channels = zip(*(_of_channels(block, count) for block in blocks), strict=True)
+    return [scipy.sparse.vstack(some, format="csr") for some in channels]
+
+
+def _added(found: list[list[Sparse]]) -> list[Sparse]:
+    """Sums of matrices of each channel, or of one for all."""
+    count = max(map(len, found))
+    channels = zip(*(_of_channels(some, count) for some in found), strict=True)
+    return [scipy.sparse.csr_array(sum(some[1:], some[0])) for some in channels]
+
+
+def _of_channels(matrices: Sequence[Sparse], count: int) -> Sequence[Sparse]:
+    """So many of one that is the same for all."""
+    return [matrices[0]] * count if len(matrices) == 1 else matrices
 
 
 def _weights(lobes: Lobes, point: mi.UInt32, direction: mi.Vector3f) -> Floats:
@@ -140,7 +194,7 @@ def _weights(lobes: Lobes, point: mi.UInt32, direction: mi.Vector3f) -> Floats:
 
 
 def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
-    """Light as a matrix (points * K, texels) of each channel."""
+    """Light as a matrix (points * K, texels) of each channel, or of all."""
     count, terms = found.into.shape
     columns = (found.rows[:, None] * terms + np.arange(terms)).ravel()
     starts = np.arange(0, count * terms + 1, terms)
@@ -153,4 +207,4 @@ def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
             (np.ascontiguousarray(light), found.columns, np.arange(count + 1)), shape=(count, shape[1])
         )
         matrices.append(scipy.sparse.csr_array(into @ ends).astype(np.float32))
-    return matrices * 3 if grey else matrices
+    return matrices

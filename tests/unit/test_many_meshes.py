@@ -1,8 +1,9 @@
 """Scenes of more than a dozen meshes: what a mesh gets at least is shared, and cost follows vertices, not shapes."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
+from conftest import PALE, T, build, diffuse
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.estimation import held_out
@@ -201,3 +202,41 @@ def test_pieces_of_all_meshes_are_those_of_each(scene):
         np.testing.assert_array_equal(scene.pieces[mesh.vertices], count + of_place[same])
         count += own
     assert count == len(scene.meshes)
+
+
+def test_many_round_shapes_have_few_segments_each() -> None:
+    """
+    Expected: 64 balls that are small beside the scene have 32 segments around, as one has; a thousand have 12 each, and
+        a scene of them no more than 100,000 vertices.
+    """
+
+    def balls(count: int) -> dict[str, dict]:
+        places = np.random.default_rng(0).uniform(-5, 5, (count, 3)).tolist()
+        return {
+            f"b{k}": {"type": "sphere", "center": p, "radius": 0.02, "bsdf": PALE}
+            for k, p in enumerate(places)
+        }
+
+    few, many = build(None, **balls(64)), build(None, **balls(1000))
+    around = [len(np.unique(scene.positions[scene.meshes[0].vertices][:, 2])) for scene in (few, many)]
+    assert few.n_vertices > 64 * 400
+    assert many.n_vertices < 100_000
+    assert around == [17, 7]
+
+
+def test_names_of_shapes_that_mitsuba_merged() -> None:
+    """Expected: the first one's, and how many more there are; shapes without a name are called by their type."""
+    cubes = {
+        f"c{k}": {
+            "type": "cube",
+            "to_world": T().translate([3.0 * k, 0, 0]),
+            "bsdf": {"type": "ref", "id": "paint"},
+        }
+        for k in range(5)
+    }
+    scene = mi.load_dict({"type": "scene", "paint": PALE, **cubes})
+    assert len(scene.shapes()) == 1
+    assert [mesh.name for mesh in prt.Scene.from_mitsuba(scene).meshes] == ["cube_and_4_more"]
+    quads = {name: {**cube, "type": "rectangle"} for name, cube in cubes.items()}
+    scene = mi.load_dict({"type": "scene", "paint": PALE, **quads})
+    assert [mesh.name for mesh in prt.Scene.from_mitsuba(scene).meshes] == ["mesh_0_and_4_more"]
