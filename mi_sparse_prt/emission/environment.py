@@ -145,13 +145,19 @@ def emitter_of(environment: Environment) -> mi.Emitter:
 
 def environment_of(emitter: mi.Emitter, height: int = 256) -> Environment:
     """What an environment emitter of a scene shines, as an image of (height, 2 height) pixels: at their centres."""
+    return Environment(radiance_of(emitter, height))
+
+
+def radiance_of(emitter: mi.Emitter, height: int) -> NDArray[np.float32]:
+    """What an environment emitter shines at the centres of (height, 2 height, 3) pixels; it may be negative."""
     theta, phi = (np.pi * (np.arange(n) + 0.5) / height for n in (height, 2 * height))
     x, z = np.sin(theta)[:, None] * np.sin(phi), -np.sin(theta)[:, None] * np.cos(phi)
     towards = np.stack(np.broadcast_arrays(x, np.cos(theta)[:, None], z)).reshape(3, -1)
     si = dr.zeros(mi.SurfaceInteraction3f, towards.shape[1])
     si.wi = -mi.Vector3f(np.ascontiguousarray(towards, np.float32))
     radiance = np.array(emitter.eval(si))
-    return Environment(np.broadcast_to(radiance, (3, towards.shape[1])).T.reshape(height, 2 * height, 3))
+    every = np.broadcast_to(radiance, (3, towards.shape[1])).T
+    return every.reshape(height, 2 * height, 3).astype(np.float32)
 
 
 def _rgb_of(bitmap: mi.Bitmap, path: Path) -> NDArray[np.float32]:

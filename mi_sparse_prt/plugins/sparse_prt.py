@@ -18,6 +18,7 @@ from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
 from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
+from mi_sparse_prt.relighting.sharp_light import sharp_light
 from mi_sparse_prt.scene.scene import Scene
 
 LAMP_SPP = 128  # paths per vertex and lamp, where paths are traced: a grain of 1.5% on walls
@@ -183,10 +184,14 @@ class SparsePRT(mi.SamplingIntegrator):
         if environment is None:
             return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
+        # what passes straight through surfaces is not found by a shadow ray
+        sharp = None if surfaces.passes_straight else sharp_light(environment)
         if not transport.terms:
-            irradiance = irradiance + transport.irradiance_by_depth(environment)
-            return [RelitScene(surfaces, irradiance, environment, None, depth, followed)]
-        relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment)]
+            found = transport.irradiance_by_depth(environment)
+            found = found if sharp is None else sharp.taken_from(found, transport)
+            emitter = None if sharp is None else sharp.emitter
+            return [RelitScene(surfaces, irradiance + found, environment, None, depth, followed, emitter)]
+        relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment, sharp)]
         return [*relit, RelitScene(surfaces, irradiance, None, None, depth, followed)] if lamps else relit
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:

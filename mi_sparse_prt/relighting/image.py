@@ -34,8 +34,10 @@ from mi_sparse_prt.relighting.followed_rays import (
     past_lamps,
     reflected_background,
     reflected_lamps,
+    reflected_light,
     surfaces_to_follow,
 )
+from mi_sparse_prt.relighting.sharp_light import SharpLight
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.transport import LightTransport
@@ -68,6 +70,8 @@ class RelitScene:
         As Mitsuba's ``path``; what a ray meets on its way, mirrors and glass, counts.
     followed : sequence of mi.BSDF, optional
         Of surfaces that rays go on from by all that these scatter.
+    sharp : mi.Emitter, optional
+        Light from infinitely far away that surfaces reflect at the pixel, by a shadow ray; not that of ``irradiance``.
     """
 
     def __init__(
@@ -78,7 +82,9 @@ class RelitScene:
         lamps: tuple[SampledEmission, NDArray[np.float32]] | None = None,
         max_depth: int = -1,
         followed: Sequence[mi.BSDF] = (),
+        sharp: mi.Emitter | None = None,
     ) -> None:
+        self._sharp = sharp
         self._scene, self._background, self._lamps = scene.world, background, lamps
         self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
@@ -102,7 +108,7 @@ class RelitScene:
         if self.goes_on:
             value, valid = follow(partial(self._seen, shown), ray, sampler, active, self.max_depth)
         else:
-            found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), active, active)
+            found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), sampler, active, active)
             value, valid = found.radiance, active & found.si.is_valid()
             if shown is not None:
                 value = dr.select(active & ~valid, shown.eval(found.si, active), value)
@@ -113,7 +119,7 @@ class RelitScene:
     ) -> Seen:
         """See ``follow``; what is ``shown`` is the background of rays that come straight from a camera."""
         u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
-        value, si, whole = self._met(ray, u, way.depth, active, active & ~way.last)
+        value, si, whole = self._met(ray, u, way.depth, sampler, active, active & ~way.last)
         if self._background is not None:
             leaves = active & ~si.is_valid()
             leaves &= way.met if shown is None else True
@@ -127,7 +133,13 @@ class RelitScene:
         return Seen(value, si, whole)
 
     def _met(
-        self, ray: mi.Ray3f, u: mi.Point2f, depth: mi.UInt32, active: mi.Mask, reflects: mi.Mask
+        self,
+        ray: mi.Ray3f,
+        u: mi.Point2f,
+        depth: mi.UInt32,
+        sampler: mi.Sampler,
+        active: mi.Mask,
+        reflects: mi.Mask,
     ) -> Seen:
         """What rays meet after some surfaces; their radiance where it is asked for and they are not followed."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
@@ -138,6 +150,8 @@ class RelitScene:
         corners, lit = self._hit_corners(hit, si, ray, valid, behind)
         light = (self._deepest - dr.minimum(depth, self._deepest)) * self._n_vertices
         value = dr.select(lit, self._shaded(si, corners, light, u, lit), 0)
+        if self._sharp is not None:
+            value += reflected_light(self._sharp, self._scene, si, sampler, mi.Mask(lit))
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
@@ -250,6 +264,8 @@ class GlossyRelitScene(RelitScene):
         With terms.
     environment : Environment or (n_directions, 3) float
     background : mi.Emitter or None
+    sharp : SharpLight, optional
+        Part of the environment that is found at the pixel.
 
     Raises
     ------
@@ -258,14 +274,22 @@ class GlossyRelitScene(RelitScene):
     """
 
     def __init__(
-        self, scene: Scene, transport: LightTransport, environment: Any, background: mi.Emitter | None
+        self,
+        scene: Scene,
+        transport: LightTransport,
+        environment: Any,
+        background: mi.Emitter | None,
+        sharp: SharpLight | None = None,
     ) -> None:
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients_by_depth(environment), transport.reflection
+        emitter = None
+        if sharp is not None:
+            found, emitter = sharp.taken_from_terms(found, transport), sharp.emitter
         assert isinstance(surfaces, InOutFactors)
         followed = surfaces_to_follow(scene, surfaces)
         irradiance = np.stack([some.unit_albedo for some in found])
-        super().__init__(scene, irradiance, background, None, transport.max_depth, followed)
+        super().__init__(scene, irradiance, background, None, transport.max_depth, followed, emitter)
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._light += [
             _of_depths(np.stack([some.terms[:, k] for some in found])) for k in range(transport.terms)
