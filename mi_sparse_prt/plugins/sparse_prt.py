@@ -171,7 +171,7 @@ class SparsePRT(mi.SamplingIntegrator):
             # shapes as they are, but for copies: rays that meet instances take long
             copies = any(shape.class_name() == "Instance" for shape in scene.shapes())
             lit = surfaces.mitsuba if copies else scene
-            return LampLitIntegrator(relit, lit, depth, self._hide_emitters)
+            return LampLitIntegrator(relit, lit, depth, self._hide_emitters, copies)
         return RelitIntegrator(relit[0], self._hide_emitters)
 
     def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:

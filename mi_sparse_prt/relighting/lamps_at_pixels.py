@@ -11,15 +11,17 @@ from mi_sparse_prt.relighting.followed_rays import Seen, Way, follow
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.mitsuba_meshes import scene_of
+from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.paths import has_mirrors
 
 
 class LampLitIntegrator(RelitIntegrator):
     """Looks at relit surfaces, and adds what lamps send to the camera themselves or after one reflection.
 
-    The latter is Mitsuba's ``path`` of ``max_depth`` 2 among the lamps alone: shadow rays and rays of the BSDF at every
-    sample of a pixel, on the shapes as the scene has them. Mirrors, glass and masks on the way to a surface are no
-    reflections in this sense, nor are those on the way to an area lamp, which rays of the BSDF meet or not.
+    The latter is what Mitsuba's ``path`` of ``max_depth`` 2 finds among the lamps alone: shadow rays and rays of the
+    BSDF at every sample of a pixel, on the shapes as the scene has them. Mirrors, glass and masks on the way to a
+    surface are no reflections in this sense, nor are those on the way to an area lamp, which rays of the BSDF meet or
+    not.
 
     Parameters
     ----------
@@ -31,15 +33,22 @@ class LampLitIntegrator(RelitIntegrator):
         As for ``path``, at least 2 or -1.
     hide_emitters : bool
         See ``RelitIntegrator``.
+    triangles : bool
+        The scene is one that ``TracedScene`` can look at: kernels are then traced fast, whatever else is in memory.
     """
 
     def __init__(
-        self, relit: Sequence[RelitScene], scene: mi.Scene, max_depth: int, hide_emitters: bool = False
+        self,
+        relit: Sequence[RelitScene],
+        scene: mi.Scene,
+        max_depth: int,
+        hide_emitters: bool = False,
+        triangles: bool = False,
     ) -> None:
         super().__init__(relit[0], hide_emitters)
         self._more = relit[1:]
         self._scene = scene if scene.environment() is None else without_environment(scene)
-        self._direct = mi.load_dict({"type": "path", "max_depth": 2})
+        self._traced = TracedScene(self._scene) if triangles else self._scene
         self._followed, self._max_depth = relit[-1].followed, max_depth
         self._goes_on = has_mirrors(scene) or bool(self._followed)
         self._rough_glass = relit[-1].rough_glass
@@ -57,15 +66,39 @@ class LampLitIntegrator(RelitIntegrator):
         if self._goes_on:
             direct, _ = follow(self._seen, ray, sampler, active, self._max_depth)
         else:
-            direct, _, _ = self._direct.sample(self._scene, sampler, mi.RayDifferential3f(ray), None, active)
+            direct = self._direct(self._traced.ray_intersect(ray, active), sampler, active, active)
         return value + direct, valid
+
+    def _direct(
+        self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, seen: mi.Mask, reflects: mi.Mask
+    ) -> mi.Color3f:
+        """Lamps that are ``seen``, and what surfaces reflect of them: both kinds of rays, weighted as in ``path``."""
+        value = dr.select(seen, si.emitter(self._scene, seen).eval(si, seen), 0)
+        bsdf, reflects = si.bsdf(), reflects & si.is_valid()
+        asked = reflects & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        there, light = self._scene.sample_emitter_direction(si, sampler.next_2d(asked), False, asked)
+        asked &= there.pdf > 0
+        asked &= ~self._scene.ray_test(si.spawn_ray_to(there.p), asked)
+        u, v = sampler.next_1d(reflects), mi.Point2f(sampler.next_2d(reflects))
+        reflected, density, sample, weight = bsdf.eval_pdf_sample(
+            mi.BSDFContext(), si, si.to_local(there.d), u, v, reflects
+        )
+        share = dr.select(there.delta, 1, there.pdf / (there.pdf + density))
+        value += dr.select(asked, reflected * light * share, 0)
+
+        met = self._traced.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), reflects)
+        radiance = met.emitter(self._scene, reflects).eval(met, reflects)
+        single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        towards = mi.DirectionSample3f(self._scene, met, si)
+        other = self._scene.pdf_emitter_direction(si, towards, reflects & ~single & met.is_valid())
+        share = dr.select(single, 1, sample.pdf / (sample.pdf + other))
+        lit = reflects & ~dr.all(radiance == 0)
+        return value + dr.select(lit, weight * radiance * share, 0)
 
     def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
         """See ``follow``; a lamp seen in a mirror is among the mirror's direct light."""
-        si, reflects = self._scene.ray_intersect(ray, active), active & ~way.last
-        direct, _, _ = self._direct.sample(self._scene, sampler, mi.RayDifferential3f(ray), None, reflects)
-        before = reflects & (way.depth > 0)
-        direct -= dr.select(before, si.emitter(self._scene, before).eval(si, before), 0)
+        si, reflects = self._traced.ray_intersect(ray, active), active & ~way.last
+        direct = self._direct(si, sampler, reflects & (way.depth == 0), reflects)
         whole = is_one_of(self._followed, si)
         if self._caustics:
             direct += self._by_mirrors(si, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
@@ -85,7 +118,7 @@ class LampLitIntegrator(RelitIntegrator):
         sample, weight = si.bsdf().sample(smooth, si, u, v, active)
 
         def emitted(ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
-            met = self._scene.ray_intersect(ray, active)
+            met = self._traced.ray_intersect(ray, active)
             lit = active & (way.depth > depth)
             radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
             rough = active & is_one_of(self._rough_glass, met)
