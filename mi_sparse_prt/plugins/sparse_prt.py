@@ -36,6 +36,10 @@ class SparsePRT(mi.SamplingIntegrator):
     only apply them. The camera sees the irradiance of the vertices, interpolated over triangles, times the albedo
     texture at the pixel.
 
+    A sun, or another small bright part of the environment that brings a tenth of its light or more, casts its shadows
+    at the pixel, by one shadow ray of each sample, unless light passes straight through surfaces of the scene. All else
+    of the environment comes from the matrix, without noise.
+
     Lamps are all other emitters (``area``, ``point``, ``spot``, ``directional``, ``projector``). They have a matrix of
     their own, a column each, for light that is reflected more than once. What they send to the camera themselves, or
     after one reflection, is found at the pixel as ``path`` finds it, by shadow rays: shadows of small lamps are

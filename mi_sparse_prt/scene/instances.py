@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,14 +11,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mesh_cleaning import flip_sides
 from mi_sparse_prt.scene.traversal import children
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, concatenated, normalise_rows
 
 MERGED = " + "  # between the names of meshes that Mitsuba has merged into one
-MANY = 100  # instances: the time for a kernel grows as their square, a tenth of a second for so many, ten for 1000
 
 
 @dataclass(frozen=True)
@@ -145,18 +143,6 @@ def _channels(mesh: TriangleMesh) -> tuple[Hashable, ...]:
     """What a mesh has beside positions and normals."""
     attributes = {**mesh.vertex_attributes, **mesh.face_attributes}
     return (mesh.texcoords is None, *sorted((name, v.shape[1]) for name, v in attributes.items()))
-
-
-def warn_of_many(scene: mi.Scene) -> None:
-    """Say that work beside a scene of many instances takes long, before it is begun."""
-    count = sum(shape.class_name() == "Instance" for shape in scene.shapes())
-    if count > MANY:
-        warnings.warn(
-            f"the scene has {count} instances: as long as it is in memory, Mitsuba takes seconds to trace each of "
-            "hundreds of kernels; load the file with prt.load_scene, which does not keep it, and use prt.render",
-            PrtWarning,
-            stacklevel=3,
-        )
 
 
 def _instances(scene: mi.Scene) -> list[tuple[mi.Shape, NDArray[np.float64]]]:

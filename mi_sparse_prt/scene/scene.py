@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.random_keys import hash_rows, mix
-from mi_sparse_prt.scene.instances import warn_of_many
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene, objects_off_shapes
 from mi_sparse_prt.scene.shape_table import ShapeTable
@@ -186,7 +185,6 @@ class Scene:
             No mesh; a shape that cannot become triangles (`sdfgrid`); positions or normals that are not finite; an
             albedo outside [0, 1]; more than 5 million vertices.
         """
-        warn_of_many(scene)
         result = cls._build(scene, edge_length)
         result._warn()
         return result

@@ -1,7 +1,6 @@
 """Instances, ellipsoids and curves as triangles, against Mitsuba's own intersections with the original shapes."""
 
 import gc
-import warnings
 from pathlib import Path
 
 import drjit as dr
@@ -89,17 +88,6 @@ def test_instances_become_one_mesh_for_each_bsdf() -> None:
     assert all(shape.is_mesh() for shape in (*scene.mitsuba.shapes(), *scene.normalised.shapes()))
     np.testing.assert_allclose(np.unique(scene.albedo[scene.meshes[1].vertices]), [0.1, 0.2, 0.6], atol=1e-6)
     check_hits(original, scene, missed=0.01, off=1e-3, textured=False)  # constant BSDFs need no coordinates
-
-
-def test_many_instances_in_memory_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Expected: a sentence where the user's scene stays in memory, before the work; none of a file that is loaded."""
-    monkeypatch.setattr("mi_sparse_prt.scene.instances.MANY", 1)
-    with pytest.warns(prt.PrtWarning, match=r"15 instances: .* load the file with prt.load_scene"):
-        Scene.from_mitsuba(mi.load_dict(bricks(15)), 1)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        prt.load_scene(ZOO / "shape_instance.xml", 1)
-    assert not any("instances" in str(warning.message) for warning in said)
 
 
 @pytest.mark.parametrize("named", ["shapes", "groups", "both together"])
