@@ -37,8 +37,7 @@ class SparsePRT(mi.SamplingIntegrator):
     texture at the pixel.
 
     A sun, or another small bright part of the environment that brings a tenth of its light or more, casts its shadows
-    at the pixel, by one shadow ray of each sample, unless light passes straight through surfaces of the scene. All else
-    of the environment comes from the matrix, without noise.
+    at the pixel, by one shadow ray of each sample. All else of the environment comes from the matrix, without noise.
 
     Lamps are all other emitters (``area``, ``point``, ``spot``, ``directional``, ``projector``). They have a matrix of
     their own, a column each, for light that is reflected more than once. What they send to the camera themselves, or
@@ -188,8 +187,7 @@ class SparsePRT(mi.SamplingIntegrator):
         if environment is None:
             return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
-        # what passes straight through surfaces is not found by a shadow ray
-        sharp = None if surfaces.passes_straight else sharp_light(environment)
+        sharp = sharp_light(environment)
         if not transport.terms:
             found = transport.irradiance_by_depth(environment)
             found = found if sharp is None else sharp.taken_from(found, transport)

@@ -172,11 +172,19 @@ def reflected_background(
 
 
 def reflected_light(
-    light: mi.Emitter, scene: TracedScene, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, active: mi.Mask
+    light: mi.Emitter,
+    arrives: Callable[[mi.Ray3f, mi.Mask], mi.Mask],
+    si: mi.SurfaceInteraction3f,
+    sampler: mi.Sampler,
+    active: mi.Mask,
 ) -> mi.Color3f:
-    """All that surfaces reflect of light from infinitely far away, by a shadow ray; none is found by following them."""
+    """All that surfaces reflect of light from infinitely far away, by a shadow ray; none is found by following them.
+
+    ``arrives`` tells which rays nothing is in the way of.
+    """
     there, radiance = light.sample_direction(si, mi.Point2f(sampler.next_2d(active)), active)
-    active = active & (there.pdf > 0) & ~scene.ray_test(si.spawn_ray(there.d), active)
+    active = active & (there.pdf > 0)
+    active &= arrives(si.spawn_ray(there.d), active)
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(there.d), active)
     return dr.select(active, value * radiance, 0)
 

@@ -40,6 +40,8 @@ from mi_sparse_prt.relighting.followed_rays import (
 from mi_sparse_prt.relighting.sharp_light import SharpLight
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import ALL, pass_straight
+from mi_sparse_prt.solvers.problem import MOST_APART
 from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
@@ -84,7 +86,7 @@ class RelitScene:
         followed: Sequence[mi.BSDF] = (),
         sharp: mi.Emitter | None = None,
     ) -> None:
-        self._sharp = sharp
+        self._sharp, self._passes_straight = sharp, scene.passes_straight
         self._scene, self._background, self._lamps = scene.world, background, lamps
         self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
@@ -151,12 +153,27 @@ class RelitScene:
         light = (self._deepest - dr.minimum(depth, self._deepest)) * self._n_vertices
         value = dr.select(lit, self._shaded(si, corners, light, u, lit), 0)
         if self._sharp is not None:
-            value += reflected_light(self._sharp, self._scene, si, sampler, mi.Mask(lit))
+            value += reflected_light(self._sharp, self._arrives, si, sampler, mi.Mask(lit))
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, self._brightness, mi.UInt32(lamp), lamp >= 0)
         return Seen(value, si, whole)
+
+    def _arrives(self, ray: mi.Ray3f, active: mi.Mask) -> mi.Mask:
+        """Which rays leave the scene, through nothing but holes: light through panes is no part of direct light."""
+        if not self._passes_straight:
+            return ~self._scene.ray_test(ray, active)
+        longest = self.max_depth - 2
+        share, _, boundary = pass_straight(
+            self._scene,
+            ray,
+            active,
+            dr.opaque(mi.UInt32, longest if longest >= 0 else 1 << 30),
+            lambda si: si.spawn_ray(ray.d),
+            lambda passed: dr.sum(passed) / 3,
+        )
+        return (share >= ALL) & (~boundary if 0 < longest <= MOST_APART else True)
 
     def _hit_corners(
         self,

@@ -24,6 +24,19 @@ SHAPES = {
     },
     "ball": {"type": "sphere", "center": [-0.7, 0.3, 0.4], "radius": 0.3},
 }
+HOLES = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "to_uv": T().scale(2)}
+SHEETS = {
+    "holes": {
+        "type": "rectangle",
+        "to_world": T().translate([0.6, 0.7, 0.3]).rotate([1, 0, 0], -90).scale(0.4),
+        "bsdf": {"type": "mask", "opacity": HOLES, "bsdf": {"type": "twosided", "bsdf": GROUND["bsdf"]}},
+    },
+    "pane": {
+        "type": "rectangle",
+        "to_world": T().translate([0.8, 0.3, 1.2]).scale(0.3),
+        "bsdf": {"type": "thindielectric"},
+    },
+}
 CAMERA = {
     "type": "perspective",
     "fov": 40,
@@ -50,20 +63,23 @@ def picture(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> 
     return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))[..., :3].astype(np.float64)
 
 
-@pytest.mark.parametrize("ball", [None, GLOSSY], ids=["diffuse", "glossy"])
-def test_shadows_of_a_sun_are_those_of_path(tmp_path, monkeypatch, ball):
+@pytest.mark.parametrize("kind", ["diffuse", "glossy", "holes"])
+def test_shadows_of_a_sun_are_those_of_path(tmp_path, monkeypatch, kind):
     """Rationale: the ground's vertices are as far apart as the post is thick, and a texel is wider than the sun.
 
     Expected: an error of less than 3% of the picture beyond noise, and of less than 1% of its mean; by the matrix
         alone more than twice as much.
     """
     shapes = {name: {**shape, "bsdf": GROUND["bsdf"]} for name, shape in SHAPES.items()}
-    if ball:
-        shapes["ball"]["bsdf"] = ball
+    if kind == "glossy":
+        shapes["ball"]["bsdf"] = GLOSSY
+    if kind == "holes":
+        shapes |= SHEETS
     scene = mi.load_dict({"type": "scene", **shapes, "camera": CAMERA, "sky": sky(1.0)})
     options = {
         "type": "sparse_prt",
         "resolution": 8,
+        "method": "gather",
         "max_depth": 4,
         "cache": str(tmp_path),
         "progress": False,
