@@ -41,7 +41,7 @@ from mi_sparse_prt.relighting.sharp_light import SharpLight
 from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import ALL, pass_straight
-from mi_sparse_prt.solvers.problem import MOST_APART
+from mi_sparse_prt.solvers.problem import told_apart
 from mi_sparse_prt.transport import LightTransport
 
 SAMPLES_PER_PASS = 16  # so that a progress bar moves
@@ -173,7 +173,7 @@ class RelitScene:
             lambda si: si.spawn_ray(ray.d),
             lambda passed: dr.sum(passed) / 3,
         )
-        return (share >= ALL) & (~boundary if 0 < longest <= MOST_APART else True)
+        return (share >= ALL) & (~boundary if told_apart(self.max_depth) else True)
 
     def _hit_corners(
         self,

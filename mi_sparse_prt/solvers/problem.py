@@ -54,8 +54,7 @@ class Problem:
     @property
     def depths_apart(self) -> int:
         """How many surfaces light may meet, where it is told apart by their number (``ByDepth``); 0 where it is not."""
-        most = self.max_depth - 2
-        return most if self.specular_apart and 0 < most <= MOST_APART else 0
+        return told_apart(self.max_depth) if self.specular_apart else 0
 
     @property
     def channels(self) -> int:
@@ -81,6 +80,12 @@ class Problem:
         depth = self.max_depth if self.max_depth < 0 else self.max_depth - 1
         diffuse = diffuse_problem(self.scene, self.emission, depth)
         return replace(diffuse, basis=self.basis, specular_apart=self.specular_apart)
+
+
+def told_apart(max_depth: int) -> int:
+    """By how many surfaces light of such a depth is told apart, where anything mirrors it or lets it pass."""
+    most = max_depth - 2
+    return most if 0 < most <= MOST_APART else 0
 
 
 def diffuse_problem(scene: Scene, emission: Any, max_depth: int = 5) -> Problem:
