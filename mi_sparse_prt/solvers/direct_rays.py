@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
@@ -150,7 +151,7 @@ class DirectSolver:
         size = LANES // self.rays_per_element
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
-            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            points, texels = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, texel_ids))
             if self.basis == "direction":
                 visible, cos = self.trace(points, self._texels.centre(texels), mi.Mask(True))
                 cosine[part] = dr.select(visible, cos, 0).numpy()
@@ -163,7 +164,7 @@ class DirectSolver:
         seen = np.zeros(len(point_ids), dtype=bool)
         for a in range(0, len(point_ids), LANES):
             part = slice(a, a + LANES)
-            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            points, texels = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, texel_ids))
             seen[part] = self.trace(points, self._texels.centre(texels), mi.Mask(True))[0].numpy()
         return seen
 
@@ -219,7 +220,7 @@ class DirectSolver:
         size = LANES // (4 * self.rays_per_element)
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
-            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            points, texels = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, texel_ids))
             element, stratum = self._lanes(len(texels))
             point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
             if self.basis == "direction":

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import element_seeds, random_generator, random_stream
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
@@ -57,7 +58,7 @@ class LampRays:
         mean, variance = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
         for a in range(0, n, size):
             part = slice(a, a + size)
-            points, lamps = mi.UInt32(point_ids[part]), mi.UInt32(columns[part])
+            points, lamps = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, columns))
             found = self._samples(points, lamps, self._seed if seed is None else seed)
             powers = [x * x for x in found]
             dr.eval(found, powers)

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
@@ -115,7 +116,8 @@ class PathSolver:
         size = self.block_elements
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
-            block = self._estimate(mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part]), seed)
+            points, texels = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, texel_ids))
+            block = self._estimate(points, texels, seed)
             mean[part], variance[part] = block.mean, block.variance
         return Estimate(mean, variance)
 

@@ -18,6 +18,7 @@ import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.core.threads import run_in_parts
@@ -197,7 +198,7 @@ class SpecularChains:
         counts = strata**2
         of_lane = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
         first = (np.cumsum(counts) - counts).astype(np.uint32)
-        entry = mi.UInt32(of_lane)
+        entry = on_device(mi.UInt32, of_lane)
         row, cell, across, start = (
             dr.gather(mi.UInt32, mi.UInt32(x.astype(np.uint32)), entry)
             for x in (cells.rows, cells.numbers, strata, first)

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import element_seeds, mix, random_stream
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -139,7 +140,7 @@ class _TermChains(SpecularChains):
         ray, entry, rng = self._rays_into(ids, cells, strata, seed)
         of = entry.numpy()
         of_lane, share = cells.rows[of], scale[of] / np.float32(CELLS * strata[of]) ** 2
-        into = _weights(lobes, mi.UInt32(np.asarray(ids)[of_lane].astype(np.uint32)), ray.d)
+        into = _weights(lobes, on_device(mi.UInt32, np.asarray(ids)[of_lane].astype(np.uint32)), ray.d)
         for depth, ends in enumerate(self._follow(ray, dr.arange(mi.UInt32, len(of)), rng, True)):
             lanes, texels, light = kept_ends(ends)
             columns = texels.astype(np.int64) + (depth * self._size if self._apart else 0)
@@ -153,7 +154,7 @@ def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[tuple[int, l
     for first in range(0, len(ids), step):
         some = found[first : first + step].tocoo()
         rows, columns = some.coords
-        point = mi.UInt32(np.asarray(ids)[first + rows].astype(np.uint32))
+        point = on_device(mi.UInt32, np.asarray(ids)[first + rows].astype(np.uint32))
         texels = columns % problem.emission.size
         towards = mi.Vector3f(np.ascontiguousarray(problem.emission.directions[texels].T))
         light = np.repeat(some.data[:, None], 3, axis=1)

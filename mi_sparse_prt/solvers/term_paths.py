@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import LANES, DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
@@ -67,7 +68,7 @@ class TermRays:
         size = LANES // (self._direct.rays_per_element * (1 + self._terms))
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
-            points, texels = mi.UInt32(point_ids[part]), mi.UInt32(texel_ids[part])
+            points, texels = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, texel_ids))
             rows = self._direct.weighted_means(
                 points, texels, lambda point, w: [mi.Float(1), *self._lobes.incident(point, w)], seed
             )

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS, Bits, above_horizon, bit_of, count_bits, list_bits, lowest_bit
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.read_only import read_only
 from mi_sparse_prt.core.threads import run_in_parts
@@ -98,7 +99,7 @@ def _bisected(
     if not len(pairs):
         return np.zeros(0, np.float32)
     # one lane more: Dr.Jit would compile another kernel for arrays of size one
-    point, pair, kind = (mi.UInt32(np.append(x, x[-1:])) for x in (points, pairs, first_seen))
+    point, pair, kind = (on_device(mi.UInt32, np.append(x, x[-1:])) for x in (points, pairs, first_seen))
     start, middle, end = (dr.gather(mi.Point3f, place, pair) for place in paths)
     low = dr.zeros(mi.Float, len(pairs) + 1)
     for step in range(STEPS):

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.measurement.neighbours import Neighbours
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
@@ -41,8 +42,8 @@ class Walls:
         found = np.zeros(len(first), bool)
         for a in range(0, len(first), PAIRS):
             part = slice(a, a + PAIRS)
-            p, n = self._above(mi.UInt32(first[part].astype(np.uint32)))
-            q, m = self._above(mi.UInt32(second[part].astype(np.uint32)))
+            p, n = self._above(on_device(mi.UInt32, first[part].astype(np.uint32)))
+            q, m = self._above(on_device(mi.UInt32, second[part].astype(np.uint32)))
             middle = 0.5 * (p + q) + 0.5 * dr.norm(p - q) * dr.normalize(n + m)
             found[part] = (self._blocked(p, middle) | self._blocked(q, middle)).numpy()
         return found
