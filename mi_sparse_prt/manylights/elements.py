@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.manylights.clamping import kept, receiving
 from mi_sparse_prt.manylights.light_arrays import DIRECTION, LightArrays, arriving
@@ -110,7 +111,7 @@ class Elements:
         PrtError
             One is not finite.
         """
-        i, j = (mi.UInt32(np.asarray(ids, np.uint32)) for ids in (rows, columns))
+        i, j = (on_device(mi.UInt32, np.asarray(ids, np.uint32)) for ids in (rows, columns))
         value = self.element(self.samples.receivers(i), self.lights.arrays.take(j), mi.Mask(True))
         found = np.ascontiguousarray(value.numpy().T)
         self.evaluated += len(found)
@@ -192,7 +193,7 @@ class Elements:
         own = self.samples.ids[rows] % sets
         order = np.argsort(own, kind="stable")
         chosen = _on_device(ids, weights, rows[order], own[order] * total)
-        place, squares = mi.UInt32(order.astype(np.uint32)), np.zeros(total // 2)
+        place, squares = on_device(mi.UInt32, order.astype(np.uint32)), np.zeros(total // 2)
         dr.eval(place)
         for a in range(0, len(squares), step := max(1, LANES // len(rows))):
             count = min(step, len(squares) - a)
@@ -220,7 +221,7 @@ class Elements:
         projected = np.zeros((n, projection.shape[1]), np.float32)
         squares = [dr.zeros(mi.Float, n) for _ in range(3)]
         if n and len(rows):
-            receivers = self.samples.receivers(mi.UInt32(np.asarray(rows, np.uint32)))
+            receivers = self.samples.receivers(on_device(mi.UInt32, np.asarray(rows, np.uint32)))
             dr.eval(receivers)
         step = max(1, LANES // max(n, 1) // ROWS) * ROWS
         for a in range(0, len(rows) if n else 0, step):
@@ -398,7 +399,9 @@ def _pieces(count: int, size: int) -> Iterator[tuple[mi.UInt32, int]]:
 def _on_device(ids: Ids, weights: Floats, samples: Ids, starts: Ids | None = None) -> _Chosen:
     colours = np.ascontiguousarray(np.asarray(weights, np.float32).reshape(-1, 3).T)
     first = np.zeros(len(samples)) if starts is None else starts
-    columns, lanes, places = (mi.UInt32(np.ravel(x).astype(np.uint32)) for x in (ids, samples, first))
+    columns, lanes, places = (
+        on_device(mi.UInt32, np.ravel(x).astype(np.uint32)) for x in (ids, samples, first)
+    )
     factors = mi.Color3f(colours)
     dr.eval(columns, factors, lanes, places)  # or kernels know how many there are, and serve nothing else
     return _Chosen(columns, factors, lanes, places)

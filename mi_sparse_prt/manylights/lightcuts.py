@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.manylights.elements import LANES, Done, Elements, Floats
 from mi_sparse_prt.manylights.light_tree import LightTree, build_light_tree, largest_values
@@ -66,7 +67,7 @@ class _Cuts:
 
     def __init__(self, elements: Elements, tree: LightTree, rows: Ids) -> None:
         self._elements, self._tree, self._rows = elements, tree, rows
-        at = elements.samples.receivers(mi.UInt32(rows.astype(np.uint32)))
+        at = elements.samples.receivers(on_device(mi.UInt32, rows.astype(np.uint32)))
         side = dr.mulsign(at.si.sh_frame.n, mi.Frame3f.cos_theta(at.si.wi))
         parts = [at.si.p.numpy(), side.numpy(), at.weight.numpy()]
         self._receivers = np.ascontiguousarray(np.concatenate(parts).T, np.float32)

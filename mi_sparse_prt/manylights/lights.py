@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
@@ -114,7 +115,7 @@ class Lights:
 
     def take(self, ids: NDArray[np.integer]) -> LightArrays:
         """Some lights on the device."""
-        return self.arrays.take(mi.UInt32(np.asarray(ids, np.uint32)))
+        return self.arrays.take(on_device(mi.UInt32, np.asarray(ids, np.uint32)))
 
     @cached_property
     def flux(self) -> Doubles:
@@ -184,7 +185,7 @@ class _Source:
 
     def pointers(self, numbers: NDArray[np.integer]) -> mi.EmitterPtr:
         """Emitters by their numbers."""
-        index = mi.UInt32(np.asarray(numbers, np.uint32))
+        index = on_device(mi.UInt32, np.asarray(numbers, np.uint32))
         return dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
 
     def directions(self, uv: mi.Point2f) -> tuple[mi.Vector3f, mi.Color3f, mi.Float]:
@@ -315,7 +316,7 @@ def _placed(source: _Source, power: Doubles) -> _Part:
         far = mi.has_flag(lights.emitter.flags(), mi.EmitterFlags.DeltaDirection)
         lights.kind = dr.select(far, mi.UInt32(DIRECTION), EMITTER)
         lights.place = dr.select(far, mi.Point3f(found.d), found.p)
-        mean = mi.Color3f(mi.Float((power[numbers] / (4 * np.pi)).astype(np.float32)))
+        mean = mi.Color3f(on_device(mi.Float, (power[numbers] / (4 * np.pi)).astype(np.float32)))
         lights.power = dr.select(far, mi.Color3f(weight), mean)
     return _Part(lights, None, numbers)
 
@@ -345,11 +346,11 @@ def _reflected(source: _Source, power: Doubles, count: int, options: LightOption
         def emit(particle: mi.UInt32) -> tuple[mi.Ray3f, mi.Color3f, mi.UInt32, mi.PCG32]:
             place = (np.arange(particles) + 0.5) / particles
             number = np.searchsorted(np.cumsum(power) / power.sum(), place).clip(max=len(power) - 1)
-            emitter = mi.UInt32(number.astype(np.uint32))
+            emitter = on_device(mi.UInt32, number.astype(np.uint32))
             rng = _random(particles, options.seed, key)
             ray, flux = source.rays(emitter, rng)
             scale = power.sum() / (power[number] * particles)
-            return ray, flux * mi.Float(scale.astype(np.float32)), emitter, rng
+            return ray, flux * on_device(mi.Float, scale.astype(np.float32)), emitter, rng
 
         found = trace_particles(source.scene, emit, particles, options.max_depth)
         return [
@@ -402,7 +403,7 @@ def _together(parts: list[_Part], source: _Source, clamp: float) -> Lights:
         [np.flatnonzero(m)[morton_order(place[m], np.arange(m.sum(), dtype=np.uint64))] for m in (far, ~far)]
     )
     ids = lit[order]
-    arrays = whole.arrays.take(mi.UInt32(ids.astype(np.uint32)))
+    arrays = whole.arrays.take(on_device(mi.UInt32, ids.astype(np.uint32)))
     dr.eval(arrays)
     return Lights(arrays, whole.glossy, whole.group[ids], source.names, clamp, source.radius)
 

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.manylights.particles import next_2d
@@ -107,7 +108,7 @@ class Samples:
         ray, weight, rng = _camera_rays(sensor, self._places, seed)
         limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
         sample, coats = _lanes(width * height, spp, seed, surfaces.coated)
-        lane, by_coats = mi.UInt32(sample.astype(np.uint32)), mi.Bool(coats)
+        lane, by_coats = on_device(mi.UInt32, sample.astype(np.uint32)), on_device(mi.Bool, coats)
         ray, weight, rng = (dr.gather(type(x), x, lane) for x in (ray, weight, rng))
         weight *= dr.select(by_coats, mi.Float(spp), 1)
         sums = _SeenOf(scene, lane, width * height * spp) if apart else None
@@ -181,7 +182,7 @@ class Samples:
 
     def _rfilter_at(self, away: Floats, offset: int) -> Floats:
         """The filter around the centre of another pixel of a row or column."""
-        at = mi.Float(np.ascontiguousarray(away - np.float32(offset)).ravel())
+        at = on_device(mi.Float, (away - np.float32(offset)).ravel())
         return np.asarray(self._rfilter.eval(at).numpy(), np.float32).reshape(away.shape)
 
     def pixel_means(self, values: Floats, rows: NDArray[np.integer]) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import hash_rows
 from mi_sparse_prt.measurement.measurement import Measurement, MeshRange
@@ -47,7 +48,7 @@ def camera_pixels(scene: Scene, sensor: int | mi.Sensor = 0, spp: int = 16, seed
     kept = np.flatnonzero(reflects)
     if not len(kept):
         raise PrtError("the camera sees no surface that reflects; move it, or choose another sensor")
-    here = mi.UInt32(kept.astype(np.uint32))
+    here = on_device(mi.UInt32, kept.astype(np.uint32))
     points, albedo = _surface_points(scene, dr.gather(mi.SurfaceInteraction3f, si, here))
     weights = _filter_weights(film.rfilter(), places, width, height)[:, kept]
     return Measurement(

@@ -6,6 +6,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
+
 
 def overflows(density: NDArray[np.floating]) -> bool:
     """Whether numbers (any shape) are too large for float16."""
@@ -16,4 +18,6 @@ def halved(density: NDArray[np.float32]) -> NDArray[np.floating]:
     """Numbers (any shape) as float16, or as they are if that overflows."""
     if overflows(density):
         return density
-    return mi.Float16(mi.Float(density.ravel())).numpy().reshape(density.shape)  # ten times as fast as NumPy
+    return (
+        mi.Float16(on_device(mi.Float, density.ravel())).numpy().reshape(density.shape)
+    )  # ten times as fast as NumPy

@@ -62,12 +62,14 @@ def sharp_light(environment: mi.Emitter) -> SharpLight | None:
     pixels = resampled(shone, HEIGHT, 2 * HEIGHT)
     brightness = pixels @ np.array(LUMINANCE, np.float32)
     solid_angles = pixel_solid_angles(HEIGHT, 2 * HEIGHT)
+    all_of_it = float((brightness * solid_angles).sum())
+    if SMALL * brightness.max() <= WORTH * all_of_it:
+        return None  # nothing is bright enough
     order = np.argsort(brightness, axis=None)[::-1]
     within = int(np.searchsorted(np.cumsum(solid_angles.ravel()[order]), SMALL))
     rest = brightness.ravel()[order[within]]
     excess = pixels * np.maximum(1 - rest / np.maximum(brightness, 1e-30), 0)[..., None]
-    sharp, all_of_it = (float((x @ np.array(LUMINANCE) * solid_angles).sum()) for x in (excess, pixels))
-    if sharp <= WORTH * all_of_it:
+    if float((excess @ np.array(LUMINANCE) * solid_angles).sum()) <= WORTH * all_of_it:
         return None
     found = Environment(excess, source="sharp light")
     return SharpLight(found, emitter_of(found))

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
 from mi_sparse_prt.scene.notes import Fact, Notes
 from mi_sparse_prt.scene.traversal import children
@@ -176,9 +177,10 @@ class Material:
         triangle, corner = np.divmod(corner_of, 3)
 
         pi = dr.zeros(mi.PreliminaryIntersection3f, n)
-        pi.prim_index = mi.UInt32(triangle.astype(np.uint32))
+        pi.prim_index = on_device(mi.UInt32, triangle.astype(np.uint32))
         pi.prim_uv = mi.Point2f(
-            mi.Float((corner == 1).astype(np.float32)), mi.Float((corner == 2).astype(np.float32))
+            on_device(mi.Float, (corner == 1).astype(np.float32)),
+            on_device(mi.Float, (corner == 2).astype(np.float32)),
         )
         pi.shape = mi.ShapePtr(shape)
         pi.t = mi.Float(1.0)

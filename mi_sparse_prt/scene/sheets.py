@@ -16,6 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.ray_offsets import ray_offset
@@ -201,8 +202,8 @@ class _Looks:
         """
         start = np.repeat(triangles, each)
         sample = np.arange(len(start)) - np.repeat(np.cumsum(each) - each, each)
-        triangle = mi.UInt32(start.astype(np.uint32))
-        other, lit = self._met(self._rays(triangle, mi.UInt32(sample.astype(np.uint32)), seed))
+        triangle = on_device(mi.UInt32, start.astype(np.uint32))
+        other, lit = self._met(self._rays(triangle, on_device(mi.UInt32, sample.astype(np.uint32)), seed))
         own = self._pieces[start]
         facing = other >= 0
         return np.unique(own[lit]), np.unique(np.stack([own[facing], other[facing]], axis=1), axis=0)

@@ -122,5 +122,7 @@ class TracedScene:
 
 
 def _joined(buffers: Sequence[mi.Float]) -> mi.Float:
-    """One array of many."""
+    """One array of many; of one, itself."""
+    if len(buffers) == 1:
+        return mi.Float(buffers[0])
     return mi.Float(np.concatenate([buffer.numpy() for buffer in buffers])) if buffers else mi.Float()

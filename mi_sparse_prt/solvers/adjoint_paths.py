@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
@@ -320,7 +321,7 @@ class _Samples:
         element = (paths.row * lighting.n_directions + texel).numpy()
         for c in range(solver.channels):  # on the host, where sums are always taken in the same order
             sums = np.bincount(element, radiance[c].numpy(), minlength=len(found[c]))
-            found[c] += mi.Float(sums.astype(np.float32))
+            found[c] += on_device(mi.Float, sums.astype(np.float32))
 
 
 def _on_square(along: mi.Float, rng: mi.PCG32) -> mi.Point2f:

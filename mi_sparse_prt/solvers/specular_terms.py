@@ -102,11 +102,11 @@ class _TermChains(SpecularChains):
         """
         cells, strata, scale = self._worth_rays(ids, self.find_cells(ids, cells_seed), cells_seed)
         self.traced += len(ids) * CELLS**2 + int((strata**2).sum())
-        rays = np.concatenate([[0], np.cumsum(strata**2)])
         starts = np.searchsorted(cells.rows, np.arange(len(ids) + 1))
+        rays = np.concatenate([[0], np.cumsum(strata**2)])[starts]  # before each point
         first = 0
         while first < len(ids):
-            most = int(np.searchsorted(rays[starts], rays[starts[first]] + LANES // 8, side="right")) - 1
+            most = int(np.searchsorted(rays, rays[first] + LANES // 8, side="right")) - 1
             last = min(max(most, first + 1), len(ids))
             part = slice(starts[first], starts[last])
             if part.start < part.stop:
