@@ -1,6 +1,7 @@
 """What whole scenes cost and how right their matrices are: seconds in bare rays, told and found errors, images.
 
-    python docs/whole_scenes.py [SCENE.xml ...] [--resolution 16] [--target 0.05] [--basis texel] [--rows 0] [--image]
+    python docs/whole_scenes.py [SCENE.xml ...] [--resolution 16] [--target 0.05] [--specular 0.1] [--basis texel]
+                                [--rows 0] [--image]
 
 A line of JSON for each scene, those of scenes_xml/whole if none is given. ``seconds`` are of ``prt.precompute`` with
 ``method="auto"`` in a process that did the same once before (``first_seconds``, with compilation); ``bare_seconds``
@@ -46,7 +47,9 @@ def bare_seconds(scene: prt.Scene, lighting: prt.CubemapLighting) -> float:
     return timed(trace)[0]
 
 
-def measure(path: Path, resolution: int, target: float, basis: str, rows: int) -> dict[str, Any]:
+def measure(
+    path: Path, resolution: int, target: float, specular: float | None, basis: str, rows: int
+) -> dict[str, Any]:
     """Times and errors of one scene's matrix."""
     lighting = prt.CubemapLighting(resolution)
     with warnings.catch_warnings():
@@ -55,7 +58,9 @@ def measure(path: Path, resolution: int, target: float, basis: str, rows: int) -
         bare = bare_seconds(scene, lighting)
 
         def precompute() -> prt.LightTransport:
-            return prt.precompute(scene, lighting, basis=basis, target_error=target, progress=False)
+            return prt.precompute(
+                scene, lighting, basis=basis, target_error=target, specular_error=specular, progress=False
+            )
 
         first, _ = timed(precompute)
         seconds, transport = timed(precompute)
@@ -66,6 +71,9 @@ def measure(path: Path, resolution: int, target: float, basis: str, rows: int) -
         "scene": path.stem,
         "resolution": resolution,
         "target": target,
+        "specular_target": specular,
+        "specular_noise": transport.report["specular_noise"],
+        "parts": transport.report["estimated_error"]["parts"],
         "basis": basis,
         "rows": transport.shape[0],
         "first_seconds": first,
@@ -97,6 +105,7 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE.xml")
     parser.add_argument("--resolution", type=int, default=16)
     parser.add_argument("--target", type=float, default=0.05)
+    parser.add_argument("--specular", type=float, help="specular_error, which target is then without")
     parser.add_argument("--basis", choices=("direction", "texel"), default="texel")
     parser.add_argument(
         "--rows", type=int, default=0, help="vertices to compare with Mitsuba's rows; none by default"
@@ -110,7 +119,10 @@ def main() -> None:
             print(json.dumps(measure_image(*arguments)), flush=True)
             continue
         with context.Pool(1) as pool:
-            print(json.dumps(pool.apply(measure, (*arguments, options.basis, options.rows))), flush=True)
+            print(
+                json.dumps(pool.apply(measure, (*arguments, options.specular, options.basis, options.rows))),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

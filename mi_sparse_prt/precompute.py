@@ -38,6 +38,7 @@ from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflecti
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.specular import ENOUGH, SpecularLight
 from mi_sparse_prt.transport import LightTransport
 
 FACTOR_SHARE = 0.5  # of the target error, which the factors of BRDFs may have; a quarter of its square
@@ -63,6 +64,7 @@ def precompute(
     terms: int | str = 0,
     harmonics: int | None = None,
     max_seconds: float = 300.0,
+    specular_error: float | None = None,
 ) -> LightTransport:
     """Compute the light transport matrix of a scene.
 
@@ -124,15 +126,19 @@ def precompute(
     max_seconds : float
         ``"auto"`` begins nothing that is predicted to take longer in all: of the plans within it the one that suits
         the target error best is carried out, and a warning says what more time would buy.
+    specular_error : float, optional
+        Noise of light that arrives by way of mirrors and glass, relative L2 of that light alone. It is sharp, and each
+        halving of its noise takes four times the rays: if given, it is apart from ``target_error``, which then is for
+        all other light. The error in the report is of both.
 
     Returns
     -------
     LightTransport
         With ``report``: ``seconds`` per phase (``compile`` apart, see ``profiling.Stopwatch``), ``elements_total``,
         ``elements_evaluated``, ``rays``, ``estimated_error``, ``skipped``, ``forecast`` (``seconds``, ``bytes``),
-        ``plan`` (what was carried out: ``direct``, ``indirect``, ``parameters``), ``plans`` (of ``"auto"``: the same
-        and ``predicted_seconds``, ``predicted_error`` and ``chosen`` of each), ``peak_memory_bytes``, ``seed``,
-        ``parameters``, ``versions``.
+        ``specular_noise`` (relative L2 of light by way of mirrors and glass alone, or None), ``plan`` (what was carried
+        out: ``direct``, ``indirect``, ``parameters``), ``plans`` (of ``"auto"``: the same and ``predicted_seconds``,
+        ``predicted_error`` and ``chosen`` of each), ``peak_memory_bytes``, ``seed``, ``parameters``, ``versions``.
 
     Raises
     ------
@@ -144,7 +150,8 @@ def precompute(
     folder = Path(checkpoint_folder) if checkpoint_folder else None
     run = Run(seed, progress=progress, checkpoint_folder=folder)
     if not isinstance(lighting, CubemapLighting):
-        _check_sampled(lighting, method, terms, harmonics, target_error, indirect_resolution)
+        given = harmonics, target_error, indirect_resolution, specular_error
+        _check_sampled(lighting, method, terms, given)
     settings = Settings(
         lighting.resolution if isinstance(lighting, CubemapLighting) else 1,
         method,
@@ -159,6 +166,7 @@ def precompute(
         harmonics,
         where.kind,
         max_seconds,
+        specular_error,
     )
     reset_peak_memory()
     if not isinstance(lighting, CubemapLighting):
@@ -206,6 +214,7 @@ class _Attempts:
         with run.clock.phase("held_out"):
             error = held_out_error(problem, transport, run.seed, indirect=self._dark is None)
         _warn_if_missed(error, self._settings, self._proposals.too_long)
+        _warn_of_specular_noise(parts.specular, self._settings.specular_error)
         transport.report.update(
             _account(parts, problem, _skipped(problem.scene, self._dark, error))
             | {"estimated_error": error.report(), "plans": self._proposals.report()}
@@ -274,9 +283,11 @@ class _Attempts:
         parts = _with_costs_of(attempts, which)
         if self._specular is None or self._specular.done:
             return parts
-        found = found or self._judged(parts, len(attempts), TARGET)
+        beside = None
+        if self._specular.own is None:
+            beside = found or self._judged(parts, len(attempts), TARGET)
         with self._run.clock.phase("specular"):
-            self._specular.refine(found)
+            self._specular.refine(beside)
             light = self._specular.light
         return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 
@@ -321,21 +332,17 @@ def _check_sampled(
     lighting: Any,
     method: str | Plan,
     terms: int | str,
-    harmonics: int | None,
-    target_error: float | None,
-    indirect_resolution: int | None,
+    others: tuple[float | None, ...],
 ) -> None:
     """Refuse what is for light from a cubemap alone."""
     if not callable(getattr(lighting, "sample", None)):
         raise PrtError(
             f"lighting is {lighting!r}: give a CubemapLighting, SceneEmitters, or what samples its elements as these do"
         )
-    if terms not in (0, AUTO_TERMS) or any(
-        value is not None for value in (harmonics, target_error, indirect_resolution)
-    ):
+    if terms not in (0, AUTO_TERMS) or any(value is not None for value in others):
         raise PrtError(
-            "lamps: terms, harmonics, target_error and indirect_resolution are for light from a cubemap; "
-            "leave them out"
+            "lamps: terms, harmonics, target_error, indirect_resolution and specular_error are for light from a "
+            "cubemap; leave them out"
         )
     if method not in ("auto", "gather", "brute_force"):
         raise PrtError(f'method {method!r} knows no lamps; use "gather" or "brute_force", or leave it out')
@@ -442,7 +449,9 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
     target, asked = settings.target_error, settings.target_error is not None
     if settings.method == "auto" and target is None and not settings.view_dependent:
         target = WORST_FACTOR * TARGET
-    if target is None or error.dark or error.total - 2 * error.standard_error["total"] <= target:
+    specular = error.parts.get("specular", 0.0) if settings.specular_error else 0.0
+    estimate = math.sqrt(max(error.total**2 - specular**2, 0.0))
+    if target is None or error.dark or estimate - 2 * error.standard_error["total"] <= target:
         return
     more = ""
     if too_long is not None:
@@ -455,7 +464,17 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
     missed = (
         f"the target error {target:g} was not met" if asked else "no target error was given, 2% was aimed at"
     )
-    warnings.warn(f"{missed}: the estimate is {error.total:.3g}{more}", PrtWarning, stacklevel=4)
+    warnings.warn(f"{missed}: the estimate is {estimate:.3g}{more}", PrtWarning, stacklevel=4)
+
+
+def _warn_of_specular_noise(light: SpecularLight | None, wanted: float | None) -> None:
+    """Say that light by way of mirrors and glass has more noise than was asked for."""
+    if light is not None and wanted is not None and light.noise > math.sqrt(ENOUGH) * wanted:
+        warnings.warn(
+            f"specular_error {wanted:g} was not met: light by way of mirrors and glass has {light.noise:.3g}",
+            PrtWarning,
+            stacklevel=4,
+        )
 
 
 def _expectation(problem: Problem, expected: Forecast) -> str:
@@ -516,6 +535,7 @@ def _account(parts: MethodResult, problem: Problem, skipped: list[str]) -> dict[
         "sampling": parts.sampling,
         "radiosity": parts.radiosity,
         "skipped": skipped,
+        "specular_noise": None if parts.specular is None else parts.specular.noise,
     }
 
 

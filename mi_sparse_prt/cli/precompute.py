@@ -65,6 +65,15 @@ TargetError = Annotated[
         show_default="auto: 0.02, and one try",
     ),
 ]
+SpecularError = Annotated[
+    float | None,
+    typer.Option(
+        metavar="ERROR",
+        help="Noise of light that arrives by way of mirrors and glass, of that light alone; --target-error is then for "
+        "all other light.",
+        show_default="part of --target-error",
+    ),
+]
 MaxSeconds = Annotated[
     float,
     typer.Option(metavar="SECONDS", help="auto begins nothing that is predicted to take longer in all."),
@@ -105,6 +114,7 @@ def precompute(
     spp: Samples = None,
     indirect_resolution: IndirectResolution = None,
     target_error: TargetError = None,
+    specular_error: SpecularError = None,
     max_seconds: MaxSeconds = 300.0,
     terms: Terms = None,
     explain: Explain = False,
@@ -148,6 +158,7 @@ def precompute(
                 checkpoint_folder=checkpoint,
                 terms=_number_or_word(terms or "0"),
                 max_seconds=max_seconds,
+                specular_error=specular_error,
             )
         # what `relight` needs to load the same scene again
         transport.report["scene"] |= {

@@ -40,6 +40,7 @@ class Settings:
     harmonics: int | None = None
     measurement: str = "vertices"
     max_seconds: float = 300.0
+    specular_error: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.method, str) and self.method not in METHODS:
@@ -60,8 +61,10 @@ class Settings:
                 raise PrtError(f"{name} is {value}; it must be a whole number of at least {least}")
         if self.max_depth < 2 and self.max_depth != -1:
             raise PrtError(f"max_depth is {self.max_depth}; 2 is direct light only, -1 is no limit")
-        if self.target_error is not None and not self.target_error > 0:
-            raise PrtError(f"target_error is {self.target_error}; it must be positive, 0.02 for 2%")
+        for name in ("target_error", "specular_error"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise PrtError(f"{name} is {value}; it must be positive, 0.02 for 2%")
         if not self.max_seconds > 0:
             raise PrtError(f"max_seconds is {self.max_seconds}; it must be positive, 300 for five minutes")
         self._check_terms()

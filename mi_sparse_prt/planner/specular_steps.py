@@ -26,12 +26,19 @@ class SpecularSteps:
     problem : Problem
         With light that is ``specular_apart``.
     settings : Settings
-        Whose ``specular.error`` is aimed at.
+        Whose ``specular.error`` is aimed at, beside the errors of all other light; or ``specular_error`` for this light
+        alone, if given.
     seed : int
+
+    Attributes
+    ----------
+    own : float or None
+        What is aimed at for this light alone, relative to its own norm; it is then no part of the error of all.
     """
 
     def __init__(self, problem: Problem, settings: Settings, seed: int) -> None:
         self._aim, self._target = settings.specular.error, settings.target_error
+        self.own = settings.specular_error
         self._search = SpecularSearch(problem, seed, settings.specular)
         self._search.refine(AS_SOURCE * self._aim)
         self._terms = term_rows(problem, seed) if problem.reflection.terms else None
@@ -49,26 +56,29 @@ class SpecularSteps:
 
     @property
     def error(self) -> float:
-        """What its noise will be if other light has smaller errors."""
-        return min(self._aim, self._search.error)
+        """What its noise will be if other light has smaller errors, as a part of the error of all."""
+        return 0.0 if self.own else min(self._aim, self._search.error)
 
     @property
     def done(self) -> bool:
         """Whether there is no more noise than is aimed at."""
-        return self._search.error <= self._aim
+        return self._search.noise <= self.own if self.own else self._search.error <= self._aim
 
     def foreseen(self, found: HeldOutError) -> HeldOutError:
-        """Errors of a matrix with this light, found now, as they will be with ``error``."""
+        """Errors of a matrix with this light, found now, as they will be with ``error``: those that a target is for."""
         now = found.parts.get("specular", 0.0)
         after = now * self.error / max(self._search.error, 1e-300)
         total = math.sqrt(max(found.total**2 - now**2 + after**2, 0.0))
         return replace(found, total=total, parts=found.parts | {"specular": after})
 
-    def refine(self, found: HeldOutError) -> None:
-        """Take the noise away that matters beside errors that are known to stay, or to a target.
+    def refine(self, found: HeldOutError | None) -> None:
+        """Take the noise away that matters beside errors that are known to stay, or to a target; or to ``own``.
 
         It may be as large as makes the error a tenth larger, or as the target leaves room for.
         """
+        if found is None:
+            self._search.refine_alone(self.own or self._aim)
+            return
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
         self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room))

@@ -84,6 +84,8 @@ class SparsePRT(mi.SamplingIntegrator):
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the environment's matrix to aim at. (0: that of
                                    ``prt.precompute``)
+    specular_error      float      Noise of light by way of mirrors and glass, of that light alone. (0: it is part of
+                                   ``target_error``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               string or  In-out factors of each BSDF that is not diffuse, which is then shaded for the view,
@@ -111,6 +113,7 @@ class SparsePRT(mi.SamplingIntegrator):
             "spp": props.get("precompute_spp") if "precompute_spp" in props else None,
             "indirect_resolution": props.get("indirect_resolution", coarse) or None,
             "target_error": props.get("target_error", 0.0) or None,
+            "specular_error": props.get("specular_error", 0.0) or None,
             "max_seconds": props.get("max_seconds", 300.0),
             "strata": props.get("strata", 2),
             "seed": props.get("seed", 0),

@@ -180,6 +180,11 @@ class SpecularSearch:
         """As of ``SpecularLight``, of what was found so far."""
         return self._relative(sum(part.total.square for part in self._parts) + self._direct)
 
+    @property
+    def noise(self) -> float:
+        """As of ``SpecularLight``, of what was found so far."""
+        return self._relative(sum(part.total.square for part in self._parts))
+
     def _relative(self, square: float) -> float:
         return float(np.sqrt(sum(part.total.noise for part in self._parts) / max(square, 1e-300)))
 
@@ -189,15 +194,19 @@ class SpecularSearch:
         for part in self._parts:
             part.refine(_Limit(share, share * self._direct))
 
+    def refine_alone(self, noise: float) -> None:
+        """The same, relative to specular light alone, as ``noise`` is."""
+        for part in self._parts:
+            part.refine(_Limit(noise**2, 0.0))
+
     def light(self) -> SpecularLight:
         """What was found so far."""
         halves = [half for part in self._parts for half in part.total.halves]
         mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
         grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
         matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
-        noise = self._relative(sum(part.total.square for part in self._parts))
         rays = sum(part.total.rays for part in self._parts)
-        return SpecularLight(matrices, self._depths, noise, self.error, rays, self.seen)
+        return SpecularLight(matrices, self._depths, self.noise, self.error, rays, self.seen)
 
 
 class _Mean:

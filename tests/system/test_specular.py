@@ -238,6 +238,29 @@ def test_noise_is_told():
 
 
 @pytest.mark.usefixtures("no_held_out")
+def test_noise_of_its_own():
+    """Expected: with ``specular_error``, light by way of mirrors and glass is as far off as that, and as is told."""
+    scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(8)
+
+    def found(error: float, seed: int) -> tuple[np.ndarray, dict]:
+        settings = {"basis": "texel", "specular_error": error, "seed": seed, "progress": False}
+        transport = prt.precompute(scene, lighting, "gather", **settings)
+        albedo = scene.albedo.mean(axis=1)[:, None, None]
+        return transport.operators["specular"].rows(np.arange(scene.n_vertices)) * albedo, transport.report
+
+    exact, _ = found(0.03, 1)
+    rays = []
+    for wanted in (0.3, 0.06):
+        light, report = found(wanted, 2)
+        true, told = np.linalg.norm(light - exact) / np.linalg.norm(exact), report["specular_noise"]
+        print(f"asked {wanted}, told {told:.3f}, true {true:.3f}, {report['rays']['specular']} rays")
+        assert told < 1.12 * wanted
+        assert true == pytest.approx(np.hypot(told, 0.03), rel=0.1)
+        rays.append(report["rays"]["specular"])
+    assert rays[1] > 1.2 * rays[0]
+
+
+@pytest.mark.usefixtures("no_held_out")
 def test_each_surface_on_the_way_counts():
     """A floor in a box of air is black at max_depth 2, and lit at 3: light crosses one wall of the box."""
     shapes = {

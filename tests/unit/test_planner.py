@@ -626,6 +626,41 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
         assert asked == pytest.approx([4 * aim, least], rel=0.01)
 
 
+def test_noise_of_specular_light_alone(monkeypatch):
+    """
+    Scenario: ``specular_error`` is given; half of the error of all is noise of specular light.
+    Expected: that noise is no part of the error that the target is for, before or after; in the end it is as was asked.
+    """
+    asked = []
+
+    class Search:
+        error, noise, seen = 0.04, 0.3, None
+
+        def __init__(self, *_: object) -> None: ...
+
+        def refine(self, error: float) -> None:
+            asked.append(("all", error))
+
+        def refine_alone(self, noise: float) -> None:
+            asked.append(("alone", noise))
+
+    monkeypatch.setattr(
+        importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
+    )
+    problem = SimpleNamespace(reflection=SimpleNamespace(terms=0))
+    steps = SpecularSteps(problem, Settings(8, target_error=0.02, specular_error=0.1), 0)
+    assert steps.error == 0 and not steps.done
+    found = HeldOutError(
+        0.05, {}, {"total": 0.0}, 100, {"direct": 0.0, "indirect": 0.03, "specular": 0.04}, []
+    )
+    assert steps.foreseen(found).total == pytest.approx(0.03)
+    steps.refine(None)
+    assert asked == [("all", pytest.approx(4 * 0.02 / math.sqrt(2))), ("alone", 0.1)]
+    assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
+    with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
+        Settings(8, specular_error=0)
+
+
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
     """Expected: if the second of two plans turns out worse, the matrix and its report are those of the first."""
     lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3))
