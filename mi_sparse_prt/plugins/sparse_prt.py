@@ -91,7 +91,8 @@ class SparsePRT(mi.SamplingIntegrator):
     terms               string or  In-out factors of each BSDF that is not diffuse, which is then shaded for the view,
                         integer    per pixel: ``auto`` (as many as the target error asks for, 16 at most), or a number;
                                    with 0, all count as diffuse. Rays go on from what has no factors. (auto)
-    edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64)
+    edge_length         float      Longest edge of a triangle, world units. (the scene's diagonal / 64,
+                                   and less near small things)
     seed                integer    Of the precomputation. (0)
     cache               string     Folder of the cache. (``mi_sparse_prt`` in the user's cache folder)
     hide_emitters       boolean    As for ``path``: cameras see through area lamps, and no environment. (false)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.mesh_cleaning import flip_sides
-from mi_sparse_prt.scene.subdivision import TIE, too_many_vertices
+from mi_sparse_prt.scene.subdivision import TIE, Doubles, Project, as_it_is, too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals, unique_rows
 
 FEWEST = 32  # segments around a shape, whatever the edge length
@@ -122,6 +122,24 @@ def parametric_mesh(
         first, index = unique_rows(keys)
         mesh = replace(mesh.take_vertices(first, index[triangles]), texcoords=None)
     return flip_sides(mesh) if flip else mesh
+
+
+def projection(shape: str, to_world: NDArray[np.float64]) -> Project:
+    """How points and normals next to a shape come to lie on it; arguments as those of ``parametric_mesh``."""
+    if shape == "disk":
+        return as_it_is
+    to_local, axes = np.linalg.inv(to_world), 3 if shape == "sphere" else 2
+
+    def project(points: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
+        local = points @ to_local[:3, :3].T + to_local[:3, 3]
+        radial = np.zeros_like(local)
+        radial[:, :axes] = normalise_rows(local[:, :axes])
+        local[:, :axes] = radial[:, :axes]
+        outwards = normalise_rows(radial @ to_local[:3, :3])
+        side = np.sign(np.sum(outwards * normals, axis=1, keepdims=True))
+        return local @ to_world[:3, :3].T + to_world[:3, 3], side * outwards
+
+    return project
 
 
 def _segments(length: float, edge_length: float) -> int:

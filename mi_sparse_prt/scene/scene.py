@@ -26,6 +26,7 @@ from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene, objects_off_shapes
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
+from mi_sparse_prt.scene.sizing_field import Details
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.traversal import places_of_lamps
@@ -98,9 +99,11 @@ class Scene:
         World space: the meshes of `fronts`, in that order and with these vertices, plus the sensors, emitters
         and integrator of the original scene (the same objects; area emitters are copied, their textures are not).
     normalised : TracedScene
-        The same surfaces and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters,
-        no sensors. Of more than a dozen meshes, those of one plain material that follow each other are one shape: every
-        shape that is alive makes kernels slower to trace, a thousand of them by 0.2 s each time.
+        The same surfaces and BSDF objects in the unit box: centred on the origin, longest side 1; no emitters, no
+        sensors. Where things are small beside the scene, they are in the middle, and as large as if there were nothing
+        else: rays start off a surface by some 1e-4 of the unit, which must be little to them. Of more than a dozen
+        meshes, those of one plain material that follow each other are one shape: every shape that is alive makes
+        kernels slower to trace, a thousand of them by 0.2 s each time.
     centre : (3,) float64
     scale : float
         normalised = (world - centre) * scale, computed in float64. A scene that was scaled gives the same
@@ -117,14 +120,21 @@ class Scene:
         What it was loaded from, if it was.
     """
 
-    def __init__(self, mitsuba: mi.Scene, meshes: list[TriangleMesh], materials: list[Material]) -> None:
+    def __init__(
+        self,
+        mitsuba: mi.Scene,
+        meshes: list[TriangleMesh],
+        materials: list[Material],
+        details: Details | None = None,
+    ) -> None:
         """Use `Scene.from_mitsuba`; `meshes` are clean and in world space, `materials` one for each."""
         self.file: SceneFile | None = None
         self.notes: list[PrtWarning] = []
         fronts = np.concatenate([m.positions for m in meshes])
         low, high = (f(fronts, axis=0).astype(np.float64) for f in (np.min, np.max))
-        self.centre: NDArray[np.float64] = (low + high) / 2
-        self.scale = float(1 / np.max(high - low))
+        centre, size = ((low + high) / 2, 1.0) if details is None else details
+        self.centre: NDArray[np.float64] = centre
+        self.scale = float(1 / np.max(high - low)) / size
         # An area emitter may outlive its shape, and Mitsuba then reads freed memory: these are kept. Others are not:
         # each instance that is alive makes every kernel slower to trace
         self._original = [shape for shape in mitsuba.shapes() if shape.is_emitter()]
@@ -177,7 +187,8 @@ class Scene:
             one mesh for each BSDF of their groups. Its sensors, emitters and integrator are reused, not copied.
         edge_length : float, optional
             World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of
-            the scene's box / 64. `float("inf")` leaves meshes as they are.
+            the scene's box / 64, and shorter near small things and on them (``sizing_field``). `float("inf")` leaves
+            meshes as they are.
 
         Raises
         ------
@@ -191,11 +202,11 @@ class Scene:
 
     @classmethod
     def _build(cls, scene: mi.Scene, edge_length: float | None) -> Scene:
-        surfaces, notes = read_surfaces(scene, edge_length)
+        surfaces, details, notes = read_surfaces(scene, edge_length)
         used = [(mesh, material) for mesh, material in surfaces if len(mesh.triangles)]
         if not used:
             raise PrtError("the scene has no triangle with an area: nothing to compute transport for")
-        result = cls(scene, [mesh for mesh, _ in used], [material for _, material in used])
+        result = cls(scene, [mesh for mesh, _ in used], [material for _, material in used], details)
         result.notes = notes.warnings()
         return result
 

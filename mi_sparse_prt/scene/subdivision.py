@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,42 +16,59 @@ from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, is_flat, normalise_r
 #: of two of its default edge) do not depend on how float32 rounds a scene that was scaled or moved.
 TIE = 0.01
 
+Doubles: TypeAlias = NDArray[np.float64]
+#: Points of a surface, and its unit normals there, for points and normals next to it: (n, 3) each.
+Project: TypeAlias = Callable[[Doubles, Doubles], tuple[Doubles, Doubles]]
 
-def too_many_vertices(name: str, edge_length: float, limit: int) -> PrtError:
+
+class TooManyVerticesError(PrtError):
+    """A shape would have more vertices than allowed."""
+
+
+def too_many_vertices(name: str, edge_length: float, limit: int) -> TooManyVerticesError:
     """The error of a shape that would have more vertices than allowed."""
-    return PrtError(
+    return TooManyVerticesError(
         f"shape '{name}': edges of {edge_length:.4g} need more than {limit} vertices: "
         "use a larger edge_length (inf leaves meshes as they are)"
     )
 
 
-def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMesh:
+def as_it_is(points: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
+    """The projection of surfaces that are what their triangles are."""
+    return points, normals
+
+
+def subdivide(
+    mesh: TriangleMesh,
+    edge_length: float | Callable[[Doubles], Doubles],
+    limit: int,
+    project: Project = as_it_is,
+) -> TriangleMesh:
     """Bisect every edge longer than `edge_length` until none is left.
 
-    An edge's length decides alone, so both of its sides split at the same midpoint and no T-junction appears,
-    also between vertices that share a position but not a normal. Triangles with one, two or three long edges
-    become two, three or four. Positions, texture coordinates and attributes are interpolated linearly; normals
-    too, then normalised. The old vertices come first, in their order. What it was is kept (``unsplit``) where all
-    triangles are flat.
+    An edge's length and midpoint decide alone, so both of its sides split there and no T-junction appears, also
+    between vertices that share a position but not a normal. Triangles with one, two or three long edges become
+    two, three or four. Positions, texture coordinates and attributes are interpolated linearly; normals too, then
+    normalised. The old vertices come first, in their order. What it was is kept (``unsplit``) where all triangles
+    are flat.
 
     Parameters
     ----------
-    edge_length : float
-        In the mesh's own units; `inf` changes nothing.
+    edge_length : float or callable
+        In the mesh's own units; `inf` changes nothing. Or what gives it for midpoints of edges (n, 3): (n,).
     limit : int
         The largest number of vertices allowed.
+    project : callable
+        Puts midpoints onto a surface that is curved.
 
     Raises
     ------
-    PrtError
+    TooManyVerticesError
         If more than `limit` vertices would be needed.
     """
-    # No triangle with such edges is larger than the equilateral one, and a surface has half as many vertices as
-    # triangles: refuse what is hopeless before it is built.
-    area = float(np.linalg.norm(triangle_normals(mesh), axis=1).sum()) / 2
-    if area / (np.sqrt(3) / 4 * (edge_length * (1 + TIE)) ** 2) / 2 > 1.1 * limit:
-        raise too_many_vertices(mesh.name, edge_length, limit)
-    unsplit = mesh
+    if not callable(edge_length):
+        _check_area(mesh, edge_length, limit)
+    before = mesh
     while True:
         t = mesh.triangles
         edges = np.sort(
@@ -58,34 +77,55 @@ def subdivide(mesh: TriangleMesh, edge_length: float, limit: int) -> TriangleMes
         flat = edges.reshape(-1, 2).astype(np.int64)
         code, inverse = np.unique(flat[:, 0] * len(mesh.positions) + flat[:, 1], return_inverse=True)
         ends = np.stack(np.divmod(code, len(mesh.positions)), axis=1)  # [edge, low and high]
-        p = mesh.positions.astype(np.float64)
-        long = np.linalg.norm(p[ends[:, 0]] - p[ends[:, 1]], axis=1) > edge_length * (1 + TIE)
+        a, b = (mesh.positions.astype(np.float64)[ends[:, k]] for k in (0, 1))
+        longest = edge_length((a + b) / 2) if callable(edge_length) else edge_length
+        long = np.linalg.norm(a - b, axis=1) > longest * (1 + TIE)
         if not long.any():
-            return mesh if mesh is unsplit or not is_flat(unsplit) else replace(mesh, unsplit=unsplit)
+            return (
+                mesh
+                if mesh is before or not is_flat(before)
+                else replace(mesh, unsplit=before.unsplit or before)
+            )
         count = len(mesh.positions) + int(np.sum(long))
         if count > limit:
-            raise too_many_vertices(mesh.name, edge_length, limit)
+            raise too_many_vertices(mesh.name, float(np.min(longest)), limit)
         midpoint = np.full(len(ends), -1, np.int64)
         midpoint[long] = np.arange(len(mesh.positions), count)
-        mesh = _split(_with_midpoints(mesh, ends[long]), midpoint[inverse.reshape(-1, 3)])
+        mesh = _split(_with_midpoints(mesh, ends[long], project), midpoint[inverse.reshape(-1, 3)])
 
 
-def _with_midpoints(mesh: TriangleMesh, ends: NDArray[np.int64]) -> TriangleMesh:
+def _check_area(mesh: TriangleMesh, edge_length: float, limit: int) -> None:
+    """Refuse what is hopeless before it is built."""
+    # No triangle with such edges is larger than the equilateral one, and a surface has half as many vertices as
+    # triangles.
+    area = float(np.linalg.norm(triangle_normals(mesh), axis=1).sum()) / 2
+    if area / (np.sqrt(3) / 4 * (edge_length * (1 + TIE)) ** 2) / 2 > 1.1 * limit:
+        raise too_many_vertices(mesh.name, edge_length, limit)
+
+
+def _with_midpoints(mesh: TriangleMesh, ends: NDArray[np.int64], project: Project) -> TriangleMesh:
     """The mesh with the midpoints of the edges `ends` [edge, 2] appended to its vertices."""
 
+    def means(values: NDArray[np.float32]) -> Doubles:
+        mean: Doubles = values[ends].astype(np.float64).mean(axis=1)
+        return mean
+
+    def appended(values: NDArray[np.float32], more: Doubles) -> NDArray[np.float32]:
+        return np.concatenate([values, more.astype(np.float32)])
+
     def middle(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        mean = values[ends].astype(np.float64).mean(axis=1)
-        return np.concatenate([values, mean.astype(np.float32)])
+        return appended(values, means(values))
 
     assert mesh.normals is not None
     n = mesh.normals[ends].astype(np.float64)  # [edge, end, xyz]
     total = n.sum(axis=1)
     opposed = np.linalg.norm(total, axis=1, keepdims=True) < 1e-6
     normals = normalise_rows(np.where(opposed, n[:, 0], total))
+    points, normals = project(means(mesh.positions), normals)
     return replace(
         mesh,
-        positions=middle(mesh.positions),
-        normals=np.concatenate([mesh.normals, normals.astype(np.float32)]),
+        positions=appended(mesh.positions, points),
+        normals=appended(mesh.normals, normals),
         texcoords=None if mesh.texcoords is None else middle(mesh.texcoords),
         vertex_attributes={k: middle(v) for k, v in mesh.vertex_attributes.items()},
     )

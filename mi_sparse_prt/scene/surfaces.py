@@ -29,8 +29,9 @@ from mi_sparse_prt.scene.mesh_cleaning import (
 )
 from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
 from mi_sparse_prt.scene.notes import Fact, Notes, about
-from mi_sparse_prt.scene.parametric_shapes import FEWEST, parametric_mesh
-from mi_sparse_prt.scene.subdivision import subdivide
+from mi_sparse_prt.scene.parametric_shapes import FEWEST, parametric_mesh, projection
+from mi_sparse_prt.scene.sizing_field import Details, refine_near_details
+from mi_sparse_prt.scene.subdivision import Project, as_it_is, subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 
 ALL_ROUND = 64  # spheres, disks and cylinders of as many segments as one has: 35,000 vertices
@@ -55,7 +56,7 @@ _NO_NORMAL = Fact(": {} vertices have a normal of length zero; it is computed fr
 
 def read_surfaces(
     scene: mi.Scene, edge_length: float | None
-) -> tuple[list[tuple[TriangleMesh, Material]], Notes]:
+) -> tuple[list[tuple[TriangleMesh, Material]], Details | None, Notes]:
     """Clean triangle meshes of a Mitsuba scene, in world space, and what was handled on the user's behalf.
 
     Parameters
@@ -68,6 +69,8 @@ def read_surfaces(
     -------
     surfaces : list of (TriangleMesh, Material)
         One for each shape, and for each BSDF of the groups that have instances; a mesh may have no triangles left.
+    details : Details or None
+        Where edges are shorter than they would be for all of the scene.
     notes : Notes
 
     Raises
@@ -95,9 +98,9 @@ def read_surfaces(
         )
         limit -= 0 if mesh is None else len(mesh.positions)
         clean.append(mesh)
+    details, automatic = None, edge_length is None
     if edge_length is None:
         edge_length = _diagonal(placed, clean) / 64
-
     surfaces: list[tuple[TriangleMesh, Material]] = []
     limit, fewest = most_vertices, _segments_around(placed)
     for where, mesh, material in zip(placed, clean, materials, strict=True):
@@ -108,7 +111,13 @@ def read_surfaces(
             mesh = subdivide(mesh, edge_length, limit)
         limit -= len(mesh.positions)
         surfaces.append((mesh, material))
-    return merge_groups(placed, surfaces), notes
+    if automatic:
+        meshes = [mesh for mesh, _ in surfaces]
+        meshes, details = refine_near_details(
+            meshes, [_projection(where) for where in placed], edge_length, most_vertices
+        )
+        surfaces = list(zip(meshes, materials, strict=True))
+    return merge_groups(placed, surfaces), details, notes
 
 
 def _refuse_others(placed: list[PlacedShape]) -> None:
@@ -173,8 +182,7 @@ def _tessellate(
         return curve_mesh(shape, edge_length, where.name, limit)
     if shape.class_name() == "Ellipsoids":
         return ellipsoids_mesh(shape, edge_length, where.name, limit)
-    kind = shape.class_name().lower()
-    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    kind, to_world = shape.class_name().lower(), _to_world(shape)
     # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
     mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
     return parametric_mesh(
@@ -186,6 +194,22 @@ def _tessellate(
         fewest=fewest,
         flip=shape.has_flipped_normals() != mirrored,
         weld=material.constant,
+    )
+
+
+def _to_world(shape: mi.Shape) -> NDArray[np.float64]:
+    return np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
+def _projection(where: PlacedShape) -> Project | None:
+    """How new vertices come to lie on a shape; None where that is not known."""
+    kind = where.shape.class_name().lower()
+    if where.shape.is_mesh() or kind == "disk":
+        return as_it_is
+    return (
+        projection(kind, _to_world(where.shape))
+        if kind in ("sphere", "cylinder") and where.copies is None
+        else None
     )
 
 
