@@ -18,7 +18,7 @@ from mi_sparse_prt.scene.mesh_cleaning import drop_unreferenced
 from mi_sparse_prt.scene.subdivision import TIE, Project, TooManyVerticesError, subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
 
-ACROSS = 8  # edges along the diagonal of a piece
+ACROSS = 8  # edges along the diagonal of a piece, within a factor of sqrt(2): they are halved
 GRADE = 0.5  # by which edges grow with their distance from a piece
 SHARE = 0.25  # of the vertices there are, that may be added
 LEAST = 8192  # vertices that may be added to any scene
@@ -81,7 +81,7 @@ def refine_near_details(
 ) -> tuple[list[TriangleMesh], Details | None]:
     """Bisect edges of meshes near pieces that are small beside ``edge_length``, and edges of these pieces.
 
-    Near a connected piece of a mesh, edges are an eighth of its diagonal long at most, further away half of their
+    Near a connected piece of a mesh, edges are about an eighth of its diagonal long at most, further away half of their
     distance. Where that takes too many vertices, the shortest edges are longer. Where all pieces are large, nothing
     changes, and there are no details.
 
@@ -121,7 +121,7 @@ def _halvings(mesh: TriangleMesh, edge_length: float) -> NDArray[np.int64]:
     box = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
     fitting = np.linalg.norm(box, axis=1) / ACROSS
     halved = np.log2(edge_length / np.maximum(fitting * (1 + TIE), edge_length / 2**MOST))
-    return np.maximum(np.ceil(halved), 0).astype(np.int64)[of[mesh.triangles[:, 0]]]
+    return np.maximum(np.rint(halved), 0).astype(np.int64)[of[mesh.triangles[:, 0]]]
 
 
 def _small_pieces(

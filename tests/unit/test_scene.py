@@ -773,7 +773,7 @@ def test_parameters_reach_the_xml_and_unknown_ones_are_refused(tmp_path: Path) -
         ("cornell", (10000, 40000), False),
         ("terrace", (10000, 40000), False),
         ("foliage", (20000, 60000), False),
-        ("pergola", (20000, 62000), False),
+        ("pergola", (20000, 60000), False),
     ],
 )
 def test_shipped_scenes(name: str, vertices: tuple[int, int], grey: bool) -> None:
