@@ -127,9 +127,9 @@ def precompute(
         ``"auto"`` begins nothing that is predicted to take longer in all: of the plans within it the one that suits
         the target error best is carried out, and a warning says what more time would buy.
     specular_error : float, optional
-        Noise of light that arrives by way of mirrors and glass, relative L2 of that light alone. It is sharp, and each
-        halving of its noise takes four times the rays: if given, it is apart from ``target_error``, which then is for
-        all other light. The error in the report is of both.
+        Noise of light by way of mirrors and glass that is small enough, relative L2 of that light alone, even if it is
+        much of all: it is sharp, and each halving of its noise takes four times the rays. If given,
+        ``target_error`` is for all other light. The error in the report is of both.
 
     Returns
     -------
@@ -214,7 +214,7 @@ class _Attempts:
         with run.clock.phase("held_out"):
             error = held_out_error(problem, transport, run.seed, indirect=self._dark is None)
         _warn_if_missed(error, self._settings, self._proposals.too_long)
-        _warn_of_specular_noise(parts.specular, self._settings.specular_error)
+        _warn_of_specular_noise(parts.specular, error, self._settings)
         transport.report.update(
             _account(parts, problem, _skipped(problem.scene, self._dark, error))
             | {"estimated_error": error.report(), "plans": self._proposals.report()}
@@ -283,11 +283,9 @@ class _Attempts:
         parts = _with_costs_of(attempts, which)
         if self._specular is None or self._specular.done:
             return parts
-        beside = None
-        if self._specular.own is None:
-            beside = found or self._judged(parts, len(attempts), TARGET)
+        found = found or self._judged(parts, len(attempts), TARGET)
         with self._run.clock.phase("specular"):
-            self._specular.refine(beside)
+            self._specular.refine(found)
             light = self._specular.light
         return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 
@@ -467,9 +465,12 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
     warnings.warn(f"{missed}: the estimate is {estimate:.3g}{more}", PrtWarning, stacklevel=4)
 
 
-def _warn_of_specular_noise(light: SpecularLight | None, wanted: float | None) -> None:
-    """Say that light by way of mirrors and glass has more noise than was asked for."""
-    if light is not None and wanted is not None and light.noise > math.sqrt(ENOUGH) * wanted:
+def _warn_of_specular_noise(light: SpecularLight | None, error: HeldOutError, settings: Settings) -> None:
+    """Say that light by way of mirrors and glass has more noise than was asked for, and that it matters."""
+    wanted, target = settings.specular_error, settings.target_error or TARGET
+    if light is None or wanted is None or error.parts.get("specular", 0.0) <= target:
+        return
+    if light.noise > math.sqrt(ENOUGH) * wanted:
         warnings.warn(
             f"specular_error {wanted:g} was not met: light by way of mirrors and glass has {light.noise:.3g}",
             PrtWarning,

@@ -26,14 +26,14 @@ class SpecularSteps:
     problem : Problem
         With light that is ``specular_apart``.
     settings : Settings
-        Whose ``specular.error`` is aimed at, beside the errors of all other light; or ``specular_error`` for this light
-        alone, if given.
+        Whose ``specular.error`` is aimed at, beside the errors of all other light; ``specular_error`` of this light
+        alone is enough, if given.
     seed : int
 
     Attributes
     ----------
     own : float or None
-        What is aimed at for this light alone, relative to its own norm; it is then no part of the error of all.
+        Noise of this light that is enough, relative to its own norm; it is then no part of the error of all.
     """
 
     def __init__(self, problem: Problem, settings: Settings, seed: int) -> None:
@@ -61,8 +61,8 @@ class SpecularSteps:
 
     @property
     def done(self) -> bool:
-        """Whether there is no more noise than is aimed at."""
-        return self._search.noise <= self.own if self.own else self._search.error <= self._aim
+        """Whether there is no more noise than is aimed at, or enough."""
+        return self._search.error <= self._aim or self._search.noise <= (self.own or 0.0)
 
     def foreseen(self, found: HeldOutError) -> HeldOutError:
         """Errors of a matrix with this light, found now, as they will be with ``error``: those that a target is for."""
@@ -71,14 +71,11 @@ class SpecularSteps:
         total = math.sqrt(max(found.total**2 - now**2 + after**2, 0.0))
         return replace(found, total=total, parts=found.parts | {"specular": after})
 
-    def refine(self, found: HeldOutError | None) -> None:
-        """Take the noise away that matters beside errors that are known to stay, or to a target; or to ``own``.
+    def refine(self, found: HeldOutError) -> None:
+        """Take the noise away that matters beside errors that are known to stay, or to a target.
 
-        It may be as large as makes the error a tenth larger, or as the target leaves room for.
+        It may be as large as makes the error a tenth larger, or as the target leaves room for, or as is enough.
         """
-        if found is None:
-            self._search.refine_alone(self.own or self._aim)
-            return
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
-        self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room))
+        self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room), self.own or 0.0)

@@ -109,13 +109,14 @@ class SpecularLight:
 
 
 class _Limit(NamedTuple):
-    """What squared noise may be: a share of the squared norm of light, and a number."""
+    """What squared noise may be: a share of the squared norm of light, and a number; or a share of it alone."""
 
     share: float
     number: float
+    alone: float
 
     def of(self, square: float) -> float:
-        return self.share * square + self.number
+        return max(self.share * square + self.number, self.alone * square)
 
 
 class _Estimate(NamedTuple):
@@ -188,16 +189,11 @@ class SpecularSearch:
     def _relative(self, square: float) -> float:
         return float(np.sqrt(sum(part.total.noise for part in self._parts) / max(square, 1e-300)))
 
-    def refine(self, error: float) -> None:
-        """Trace more rays until about so much noise is left, if it is more: relative L2, as ``error`` is."""
+    def refine(self, error: float, noise: float = 0.0) -> None:
+        """Trace more rays until either is about so much: noise relative to all light, or to specular light alone."""
         share = error**2 / max(len(self._parts), 1)
         for part in self._parts:
-            part.refine(_Limit(share, share * self._direct))
-
-    def refine_alone(self, noise: float) -> None:
-        """The same, relative to specular light alone, as ``noise`` is."""
-        for part in self._parts:
-            part.refine(_Limit(noise**2, 0.0))
+            part.refine(_Limit(share, share * self._direct, noise**2))
 
     def light(self) -> SpecularLight:
         """What was found so far."""

@@ -18,7 +18,7 @@ from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
-from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.specular import SpecularLight, SpecularOptions, SpecularSearch, specular_light
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
@@ -237,27 +237,31 @@ def test_noise_is_told():
     assert noises[1] < 0.5 * noises[0]
 
 
-@pytest.mark.usefixtures("no_held_out")
 def test_noise_of_its_own():
-    """Expected: with ``specular_error``, light by way of mirrors and glass is as far off as that, and as is told."""
-    scene, lighting = build(0.35, **objects(0.6)), prt.CubemapLighting(8)
+    """
+    Expected: asked for a noise of its own, or one beside all light, a search stops at the first that it reaches; light
+        is as far off as is told.
+    """
+    scene = build(0.35, **objects(0.6))
+    problem = replace(problem_at(scene, prt.CubemapLighting(8), basis="texel"), specular_apart=True)
+    power = problem.reflection.albedo[:, None]
 
-    def found(error: float, seed: int) -> tuple[np.ndarray, dict]:
-        settings = {"basis": "texel", "specular_error": error, "seed": seed, "progress": False}
-        transport = prt.precompute(scene, lighting, "gather", **settings)
-        albedo = scene.albedo.mean(axis=1)[:, None, None]
-        return transport.operators["specular"].rows(np.arange(scene.n_vertices)) * albedo, transport.report
+    def found(error: float, noise: float, seed: int) -> tuple[np.ndarray, SpecularLight]:
+        search = SpecularSearch(problem, seed, SpecularOptions())
+        search.refine(error, noise)
+        return search.light().operator.rows(np.arange(scene.n_vertices)) * power, search.light()
 
-    exact, _ = found(0.03, 1)
-    rays = []
-    for wanted in (0.3, 0.06):
-        light, report = found(wanted, 2)
-        true, told = np.linalg.norm(light - exact) / np.linalg.norm(exact), report["specular_noise"]
-        print(f"asked {wanted}, told {told:.3f}, true {true:.3f}, {report['rays']['specular']} rays")
-        assert told < 1.12 * wanted
-        assert true == pytest.approx(np.hypot(told, 0.03), rel=0.1)
-        rays.append(report["rays"]["specular"])
-    assert rays[1] > 1.2 * rays[0]
+    exact, fine = found(1e-4, 0.03, 1)
+    share, rays = fine.error / fine.noise, []  # of specular light in all
+    for error, noise in ((1e-4, 0.3), (1e-4, 0.06), (0.06 * share, 1e-4), (0.06 * share, 0.3)):
+        light, report = found(error, noise, 2)
+        true = np.linalg.norm(light - exact) / np.linalg.norm(exact)
+        print(f"asked {error:.4f}, {noise}; told {report.noise:.3f}, true {true:.3f}, {report.rays} rays")
+        assert report.noise < 1.12 * max(noise, error / share)
+        assert true == pytest.approx(np.hypot(report.noise, 0.03), rel=0.1)
+        rays.append(report.rays)
+    assert rays[0] == rays[3] < 0.8 * rays[1]
+    assert rays[1] == pytest.approx(rays[2], rel=0.1)
 
 
 @pytest.mark.usefixtures("no_held_out")

@@ -596,11 +596,12 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     asked = []
 
     class Search:
-        error, seen = 0.2, None
+        error, noise, seen = 0.2, 1.0, None
 
         def __init__(self, *_: object) -> None: ...
 
-        def refine(self, error: float) -> None:
+        def refine(self, error: float, noise: float = 0.0) -> None:
+            assert noise == 0
             asked.append(error)
 
     module = importlib.import_module("mi_sparse_prt.planner.specular_steps")
@@ -629,7 +630,8 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
 def test_noise_of_specular_light_alone(monkeypatch):
     """
     Scenario: ``specular_error`` is given; half of the error of all is noise of specular light.
-    Expected: that noise is no part of the error that the target is for, before or after; in the end it is as was asked.
+    Expected: that noise is no part of the error that the target is for, before or after; in the end it is as was asked,
+        or as little as matters beside other errors.
     """
     asked = []
 
@@ -638,11 +640,8 @@ def test_noise_of_specular_light_alone(monkeypatch):
 
         def __init__(self, *_: object) -> None: ...
 
-        def refine(self, error: float) -> None:
-            asked.append(("all", error))
-
-        def refine_alone(self, noise: float) -> None:
-            asked.append(("alone", noise))
+        def refine(self, error: float, noise: float = 0.0) -> None:
+            asked.append((error, noise))
 
     monkeypatch.setattr(
         importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
@@ -654,8 +653,9 @@ def test_noise_of_specular_light_alone(monkeypatch):
         0.05, {}, {"total": 0.0}, 100, {"direct": 0.0, "indirect": 0.03, "specular": 0.04}, []
     )
     assert steps.foreseen(found).total == pytest.approx(0.03)
-    steps.refine(None)
-    assert asked == [("all", pytest.approx(4 * 0.02 / math.sqrt(2))), ("alone", 0.1)]
+    steps.refine(found)
+    assert asked[0] == (pytest.approx(4 * 0.02 / math.sqrt(2)), 0)
+    assert asked[1] == (pytest.approx(0.03 * math.sqrt(1 / 0.81 - 1), rel=0.01), 0.1)
     assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
     with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
         Settings(8, specular_error=0)
