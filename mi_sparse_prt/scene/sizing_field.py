@@ -23,7 +23,6 @@ GRADE = 0.5  # by which edges grow with their distance from a piece
 SHARE = 0.25  # of the vertices there are, that may be added
 LEAST = 8192  # vertices that may be added to any scene
 MOST = 12  # halvings of the longest edge: a hair's breadth of a mile
-MOST_POINTS = 5_000_000  # of small pieces of a mesh
 
 Doubles = NDArray[np.float64]
 
@@ -59,10 +58,15 @@ class SizingField:
     pieces: list[tuple[float, KDTree]]
 
     @property
+    def shortest(self) -> float:
+        """Anywhere, world units."""
+        return self.pieces[-1][0]
+
+    @property
     def details(self) -> Details:
         """Its smallest pieces."""
-        shortest, tree = self.pieces[-1]
-        return Details(np.median(tree.data, axis=0), shortest / self.longest)
+        _, tree = self.pieces[-1]
+        return Details(np.median(tree.data, axis=0), self.shortest / self.longest)
 
     def __call__(self, points: Doubles) -> Doubles:
         """Of edges whose midpoints are these, (n, 3), world units: (n,)."""
@@ -100,11 +104,18 @@ def refine_near_details(
     found, details = list(meshes), None
     count = sum(len(mesh.positions) for mesh in meshes)
     more = min(limit - count, max(LEAST, int(SHARE * count)))
-    for most in range(1, 1 + min(MOST, max((int(h.max(initial=0)) for h in halvings), default=0))):
-        field = SizingField(edge_length, _small_pieces(meshes, halvings, edge_length, most))
+    deepest = min(MOST, max((int(h.max(initial=0)) for h in halvings), default=0))
+    if not deepest:
+        return found, details
+    for most in (deepest, *range(1, deepest)):  # mostly, all can be had; if not, as much as can be
         try:
+            field = SizingField(edge_length, _small_pieces(meshes, halvings, edge_length, most, more))
             found, details = _subdivided(meshes, projections, field, more), field.details
         except TooManyVerticesError:
+            if most < deepest:
+                break
+            continue
+        if most == deepest:
             break
     return found, details
 
@@ -125,16 +136,24 @@ def _halvings(mesh: TriangleMesh, edge_length: float) -> NDArray[np.int64]:
 
 
 def _small_pieces(
-    meshes: Sequence[TriangleMesh], halvings: Sequence[NDArray[np.int64]], edge_length: float, most: int
+    meshes: Sequence[TriangleMesh],
+    halvings: Sequence[NDArray[np.int64]],
+    edge_length: float,
+    most: int,
+    more: int,
 ) -> list[tuple[float, KDTree]]:
-    """Of all meshes, by how often an edge is halved that is to fit them, ``most`` times at most."""
+    """Of all meshes, by how often an edge is halved that is to fit them, ``most`` times at most.
+
+    They have so many vertices ``more`` at most, or TooManyVerticesError.
+    """
     found = []
     for k in range(1, most + 1):
         length, points = edge_length / 2**k, []
         for mesh, own in zip(meshes, halvings, strict=True):
             belongs = own == k if k < most else own >= k
             if belongs.any():
-                piece = subdivide(drop_unreferenced(mesh.take_triangles(belongs))[0], length, MOST_POINTS)
+                piece, _ = drop_unreferenced(mesh.take_triangles(belongs))
+                piece = subdivide(piece, length, len(piece.positions) + more)
                 points.append(piece.positions.astype(np.float64))
         if points:
             every = np.concatenate(points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,17 @@ TIE = 0.01
 Doubles: TypeAlias = NDArray[np.float64]
 #: Points of a surface, and its unit normals there, for points and normals next to it: (n, 3) each.
 Project: TypeAlias = Callable[[Doubles, Doubles], tuple[Doubles, Doubles]]
+
+
+class EdgeLength(Protocol):
+    """How long edges may be, depending on where they are."""
+
+    @property
+    def shortest(self) -> float:
+        """Anywhere."""
+
+    def __call__(self, points: Doubles) -> Doubles:
+        """Of edges whose midpoints are these, (n, 3): (n,)."""
 
 
 class TooManyVerticesError(PrtError):
@@ -40,7 +51,7 @@ def as_it_is(points: Doubles, normals: Doubles) -> tuple[Doubles, Doubles]:
 
 def subdivide(
     mesh: TriangleMesh,
-    edge_length: float | Callable[[Doubles], Doubles],
+    edge_length: float | EdgeLength,
     limit: int,
     project: Project = as_it_is,
 ) -> TriangleMesh:
@@ -54,8 +65,8 @@ def subdivide(
 
     Parameters
     ----------
-    edge_length : float or callable
-        In the mesh's own units; `inf` changes nothing. Or what gives it for midpoints of edges (n, 3): (n,).
+    edge_length : float or EdgeLength
+        In the mesh's own units; `inf` changes nothing.
     limit : int
         The largest number of vertices allowed.
     project : callable
@@ -66,8 +77,11 @@ def subdivide(
     TooManyVerticesError
         If more than `limit` vertices would be needed.
     """
-    if not callable(edge_length):
-        _check_area(mesh, edge_length, limit)
+    if callable(edge_length):
+        shortest = edge_length.shortest
+    else:
+        shortest = edge_length
+        _check_area(mesh, shortest, limit)
     before = mesh
     while True:
         t = mesh.triangles
@@ -78,8 +92,10 @@ def subdivide(
         code, inverse = np.unique(flat[:, 0] * len(mesh.positions) + flat[:, 1], return_inverse=True)
         ends = np.stack(np.divmod(code, len(mesh.positions)), axis=1)  # [edge, low and high]
         a, b = (mesh.positions.astype(np.float64)[ends[:, k]] for k in (0, 1))
-        longest = edge_length((a + b) / 2) if callable(edge_length) else edge_length
-        long = np.linalg.norm(a - b, axis=1) > longest * (1 + TIE)
+        length = np.linalg.norm(a - b, axis=1)
+        long = length > shortest * (1 + TIE)
+        if callable(edge_length):
+            long[long] = length[long] > edge_length((a[long] + b[long]) / 2) * (1 + TIE)
         if not long.any():
             return (
                 mesh
@@ -88,7 +104,7 @@ def subdivide(
             )
         count = len(mesh.positions) + int(np.sum(long))
         if count > limit:
-            raise too_many_vertices(mesh.name, float(np.min(longest)), limit)
+            raise too_many_vertices(mesh.name, shortest, limit)
         midpoint = np.full(len(ends), -1, np.int64)
         midpoint[long] = np.arange(len(mesh.positions), count)
         mesh = _split(_with_midpoints(mesh, ends[long], project), midpoint[inverse.reshape(-1, 3)])
