@@ -39,8 +39,8 @@ def small_things(ground: dict) -> mi.Scene:
 def test_shadows_of_small_things(ground, tmp_path):
     """
     Scenario: a ground that is a thousand times as large as what stands on it.
-    Expected: relative L2 error of blocks of 4 x 4 pixels below 2% and mean within 1%. With edges of one length, and rays
-        that start off surfaces by 1e-4 of the scene, these were 42 and 25%, and 0.63 and 0.79.
+    Expected: relative L2 error of blocks of 4 x 4 pixels below 2% and mean within 1%. With edges of one length, and
+        rays that start off surfaces by 1e-4 of the scene, these were 42 and 25%, and 0.63 and 0.79.
     """
     lit = small_things(ground)
     settings = {
