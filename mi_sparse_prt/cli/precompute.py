@@ -69,8 +69,8 @@ SpecularError = Annotated[
     float | None,
     typer.Option(
         metavar="ERROR",
-        help="Noise of light that arrives by way of mirrors and glass, of that light alone; --target-error is then for "
-        "all other light.",
+        help="Noise of light by way of mirrors and glass that is small enough, of that light alone; --target-error is "
+        "then for all other light.",
         show_default="part of --target-error",
     ),
 ]

@@ -27,18 +27,13 @@ class SpecularSteps:
         With light that is ``specular_apart``.
     settings : Settings
         Whose ``specular.error`` is aimed at, beside the errors of all other light; ``specular_error`` of this light
-        alone is enough, if given.
+        alone is enough, if given: its noise is then no part of the error of all.
     seed : int
-
-    Attributes
-    ----------
-    own : float or None
-        Noise of this light that is enough, relative to its own norm; it is then no part of the error of all.
     """
 
     def __init__(self, problem: Problem, settings: Settings, seed: int) -> None:
         self._aim, self._target = settings.specular.error, settings.target_error
-        self.own = settings.specular_error
+        self._own = settings.specular_error
         self._search = SpecularSearch(problem, seed, settings.specular)
         self._search.refine(AS_SOURCE * self._aim)
         self._terms = term_rows(problem, seed) if problem.reflection.terms else None
@@ -57,12 +52,12 @@ class SpecularSteps:
     @property
     def error(self) -> float:
         """What its noise will be if other light has smaller errors, as a part of the error of all."""
-        return 0.0 if self.own else min(self._aim, self._search.error)
+        return 0.0 if self._own else min(self._aim, self._search.error)
 
     @property
     def done(self) -> bool:
         """Whether there is no more noise than is aimed at, or enough."""
-        return self._search.error <= self._aim or self._search.noise <= (self.own or 0.0)
+        return self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)
 
     def foreseen(self, found: HeldOutError) -> HeldOutError:
         """Errors of a matrix with this light, found now, as they will be with ``error``: those that a target is for."""
@@ -78,4 +73,4 @@ class SpecularSteps:
         """
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
-        self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room), self.own or 0.0)
+        self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room), self._own or 0.0)

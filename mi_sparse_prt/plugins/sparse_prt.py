@@ -84,8 +84,8 @@ class SparsePRT(mi.SamplingIntegrator):
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the environment's matrix to aim at. (0: that of
                                    ``prt.precompute``)
-    specular_error      float      Noise of light by way of mirrors and glass, of that light alone. (0: it is part of
-                                   ``target_error``)
+    specular_error      float      Noise of light by way of mirrors and glass that is small enough, of that light alone.
+                                   (0: it is part of ``target_error``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
     strata              integer    Shadow rays per axis of a texel, for ``texel``. (2)
     terms               string or  In-out factors of each BSDF that is not diffuse, which is then shaded for the view,

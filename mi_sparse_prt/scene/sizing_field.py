@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mi_sparse_prt.scene.mesh_cleaning import drop_unreferenced
-from mi_sparse_prt.scene.subdivision import TIE, Project, TooManyVerticesError, subdivide
+from mi_sparse_prt.scene.subdivision import TIE, Doubles, Project, TooManyVerticesError, subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
 
 ACROSS = 8  # edges along the diagonal of a piece, within a factor of sqrt(2): they are halved
@@ -23,8 +23,6 @@ GRADE = 0.5  # by which edges grow with their distance from a piece
 SHARE = 0.25  # of the vertices there are, that may be added
 LEAST = 8192  # vertices that may be added to any scene
 MOST = 12  # halvings of the longest edge: a hair's breadth of a mile
-
-Doubles = NDArray[np.float64]
 
 
 class Details(NamedTuple):
@@ -114,9 +112,9 @@ def refine_near_details(
         except TooManyVerticesError:
             if most < deepest:
                 break
-            continue
-        if most == deepest:
-            break
+        else:
+            if most == deepest:
+                break
     return found, details
 
 

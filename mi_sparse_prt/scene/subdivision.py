@@ -97,11 +97,8 @@ def subdivide(
         if callable(edge_length):
             long[long] = length[long] > edge_length((a[long] + b[long]) / 2) * (1 + TIE)
         if not long.any():
-            return (
-                mesh
-                if mesh is before or not is_flat(before)
-                else replace(mesh, unsplit=before.unsplit or before)
-            )
+            was_split = mesh is not before and is_flat(before)
+            return replace(mesh, unsplit=before.unsplit or before) if was_split else mesh
         count = len(mesh.positions) + int(np.sum(long))
         if count > limit:
             raise too_many_vertices(mesh.name, shortest, limit)

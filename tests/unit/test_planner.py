@@ -661,6 +661,23 @@ def test_noise_of_specular_light_alone(monkeypatch):
         Settings(8, specular_error=0)
 
 
+def test_too_much_noise_of_specular_light_is_told():
+    """Expected: a warning where it is more than was asked for by what a round of rays may leave, and matters."""
+    module = importlib.import_module("mi_sparse_prt.precompute")
+    settings = Settings(8, target_error=0.02, specular_error=0.1)
+
+    def told(noise: float, part: float) -> bool:
+        error = HeldOutError(part, {}, {"total": 0.0}, 100, {"specular": part}, [])
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            module._warn_of_specular_noise(SimpleNamespace(noise=noise), error, settings)
+        return bool(caught)
+
+    assert told(0.13, 0.03)
+    assert not told(0.11, 0.03)
+    assert not told(0.13, 0.019)
+
+
 def test_of_several_attempts_the_best_is_kept(grey_scene, monkeypatch):
     """Expected: if the second of two plans turns out worse, the matrix and its report are those of the first."""
     lighting, errors = prt.CubemapLighting(4), iter((0.2, 0.3))
