@@ -77,20 +77,12 @@ def parametric_mesh(
     Raises
     ------
     PrtError
-        A `to_world` of size zero, or under which the shape is no sphere or cylinder any more; more than `limit`
-        vertices.
+        A `to_world` of size zero; more than `limit` vertices.
     """
     linear = to_world[:3, :3]
     scale = np.linalg.norm(linear, axis=0)  # of the local axes x, y, z
     if not np.all(scale > 0):
         raise PrtError(f"shape '{name}': its to_world leaves no size: the scale must not be zero")
-    skew = np.abs(linear.T @ linear / np.outer(scale, scale) - np.eye(3)).max()
-    round_axes = {"sphere": scale, "cylinder": scale[:2], "disk": scale[:1]}[shape]
-    if shape != "disk" and (skew > 1e-3 or np.ptp(round_axes) > 1e-3 * scale[0]):
-        raise PrtError(
-            f"shape '{name}': the to_world of a {shape} must not shear it or scale it unevenly: "
-            "use a mesh instead"
-        )
     radius = max(scale[0], scale[1])
     around = 4 * max(fewest // 4, _segments(np.pi / 2 * radius, edge_length))
     # `angle` is the axis of (u, v) that runs around, `across` counts along the other one, `poles` are its ends

@@ -198,7 +198,12 @@ def _tessellate(
 
 
 def _to_world(shape: mi.Shape) -> NDArray[np.float64]:
-    return np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    """Local to world (4, 4). A sphere is one to Mitsuba however it is scaled: its x axis has the radius."""
+    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    if shape.class_name() == "Sphere" and (radius := np.linalg.norm(to_world[:3, 0])) > 0:
+        left, _, right = np.linalg.svd(to_world[:3, :3])
+        to_world[:3, :3] = radius * left @ right
+    return to_world
 
 
 def _projection(where: PlacedShape) -> Project | None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import mi_sparse_prt  # noqa: F401  chooses the variant
+import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.mesh_cleaning import (
     angle_weighted_normals,
@@ -145,15 +145,26 @@ def test_poles_have_texture_coordinates_of_their_own_cells() -> None:
     assert np.ptp(u, axis=1).max() < 0.05  # no triangle spans the seam or the circle around a pole
 
 
-def test_grid_refuses_shear_and_excess() -> None:
-    shear = np.eye(4)
-    shear[0, 1] = 0.3
-    for shape in ("sphere", "cylinder"):
-        with pytest.raises(PrtError, match=r"'odd'.*must not shear.*use a mesh"):
-            parametric_mesh(shape, shear, 0.1, "odd", limit=LIMIT)
-    parametric_mesh("disk", shear, 0.1, "odd", limit=LIMIT)  # Mitsuba's disk may be sheared
+def test_grid_refuses_excess() -> None:
     with pytest.raises(PrtError, match=r"'s'.*more than 1000 vertices.*larger edge_length"):
         parametric_mesh("sphere", np.eye(4), 0.01, "s", limit=1000)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cylinder", "disk"])
+def test_uneven_scale_and_shear_give_the_shape_that_rays_meet(shape: str) -> None:
+    """Mitsuba's sphere stays one whatever its ``to_world``; its cylinder and disk become elliptic."""
+    to_world = T().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 1.5, 3])
+    to_world = to_world @ mi.ScalarTransform4f([[1, 0.4, 0.2, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    ball = {"type": shape, "to_world": to_world, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}
+    loaded = mi.load_dict({"type": "scene", "ball": ball})
+    scene = prt.Scene.from_mitsuba(loaded, edge_length=0.2)
+    positions = mi.Point3f(scene.positions.T.copy())
+    normals = mi.Vector3f(scene.normals.T.copy())
+    hit = loaded.ray_intersect(mi.Ray3f(positions + normals * 0.1, -normals))
+    inside = np.linalg.norm(np.array(hit.p - positions), axis=0) < 1e-3
+    assert inside.mean() > 0.9  # some on a disk's or cylinder's edge are missed
+    turned = np.abs(np.sum(np.array(hit.n) * scene.normals.T, axis=0))[inside]
+    assert turned.min() > 1 - 1e-4
 
 
 # ------------------------------------------------------------------------------------------ subdivision
