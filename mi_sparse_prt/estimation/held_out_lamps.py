@@ -16,7 +16,7 @@ from mi_sparse_prt.transport import LightTransport
 
 POINTS = 256  # of each group, at most
 ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has fewer points
-SPP = 256
+SPP = 64
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 
 Doubles: TypeAlias = NDArray[np.float64]
@@ -66,7 +66,7 @@ def _true(problem: Problem, asked: tuple[Any, Any], seen: bool, rays: int, paths
     sent = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
     if problem.max_depth == 2:
         return _True(sent, sent)
-    reflected = light_by_paths(problem, *asked, SPP, paths)[0].astype(np.float64)
+    reflected = light_by_paths(problem, *asked, SPP, paths)[0].mean.astype(np.float64)
     if not seen:
         return _True(reflected, sent + reflected)
     every = sent + reflected + _by_mirrors(problem, asked, rays)

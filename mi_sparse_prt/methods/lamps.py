@@ -9,11 +9,13 @@ import numpy as np
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.sparse_product import multiply_scaled
 from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.dense import Dense
-from mi_sparse_prt.operators.operator import Floats
+from mi_sparse_prt.operators.operator import Floats, Operator
+from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_step
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
-from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 
@@ -53,13 +55,17 @@ def gathered_lamps(
                 indirect = _seen_from(problem, own + indirect, rays, run.seed)
                 traced += len(problem.points) * rays
     counts = {"direct": direct[..., 0].size * strata**2, "specular": arriving, "gather": traced}
-    return _result(direct if seen else None, indirect, counts)
+    return _result(direct if seen else None, None if indirect is None else Dense(indirect), counts)
 
 
 def path_traced_lamps(
     problem: Problem, run: Run, spp: int = SPP, strata: int = 16, seen: bool = True
 ) -> MethodResult:
-    """By path tracing: any BSDF; ``spp`` paths of an element at least. See ``gathered_lamps``."""
+    """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
+
+    Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
+    and meet them as well. See ``gathered_lamps``.
+    """
     n, m = len(problem.points), problem.emission.size
     direct, indirect, rays = None, None, {}
     if seen:
@@ -68,8 +74,14 @@ def path_traced_lamps(
     if problem.max_depth != 2:
         with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
             asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
-            indirect, rays["indirect_paths"] = light_by_paths(problem, *asked, spp, run.seed, bar.update)
-            indirect = indirect.reshape(n, m, 3)
+            apart = 0 if problem.scene.diffuse else told_apart(problem.max_depth)
+            found, count = light_by_paths(problem, *asked, spp, run.seed, bar.update, max(apart, 1))
+            rays["indirect_paths"] = count
+        light, variance = (x.reshape(n, m, -1) for x in (found.mean, found.variance))
+        if problem.at_vertices is problem:
+            with run.clock.phase("smoothing"):
+                light = smooth_light(light, variance, smoothing_step(problem.scene, problem.points))
+        indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
     return _result(direct, indirect, rays)
 
 
@@ -108,8 +120,13 @@ def _blocks(count: int, size: int, name: str, run: Run) -> Any:
             bar.update(len(ids))
 
 
-def _result(direct: Floats | None, indirect: Floats | None, rays: dict[str, int]) -> MethodResult:
-    parts = {"direct": direct, "indirect": indirect}
-    elements = {name: 0 if light is None else light[..., 0].size for name, light in parts.items()}
-    seen, reflected = (None if light is None else Dense(light) for light in parts.values())
-    return MethodResult(seen, reflected, max(elements.values()), elements, rays)
+def _by_depth(light: Floats, apart: int) -> ByDepth:
+    """Light that met 1, 2, ... surfaces, side by side in the last axis."""
+    return ByDepth(tuple(Dense(np.ascontiguousarray(one)) for one in np.split(light, apart, axis=2)))
+
+
+def _result(direct: Floats | None, indirect: Operator | None, rays: dict[str, int]) -> MethodResult:
+    seen = None if direct is None else Dense(direct)
+    parts = {"direct": seen, "indirect": indirect}
+    elements = {name: 0 if part is None else part.shape[0] * part.shape[1] for name, part in parts.items()}
+    return MethodResult(seen, indirect, max(elements.values()), elements, rays)

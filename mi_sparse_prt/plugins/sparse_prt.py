@@ -21,7 +21,7 @@ from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.relighting.sharp_light import sharp_light
 from mi_sparse_prt.scene.scene import Scene
 
-LAMP_SPP = 128  # paths per vertex and lamp, where paths are traced: a grain of 1.5% on walls
+LAMP_SPP = 64  # paths per vertex and lamp, where paths are traced: what is left of their grain is hardly seen
 _UNSEEN = "DirectionalArea"  # no path from a camera finds its light, those of ``path`` neither
 
 
@@ -186,7 +186,7 @@ class SparsePRT(mi.SamplingIntegrator):
         irradiance = np.zeros((1, surfaces.n_vertices, 3), np.float32)
         depth = self._settings["max_depth"]
         if lamps and depth != 2:
-            irradiance += self._light_of_lamps(surfaces)
+            irradiance = self._light_of_lamps(surfaces)
         followed = surfaces_to_follow(surfaces) if self._settings["terms"] else []
         if environment is None:
             return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
@@ -201,13 +201,15 @@ class SparsePRT(mi.SamplingIntegrator):
         return [*relit, RelitScene(surfaces, irradiance, None, None, depth, followed)] if lamps else relit
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
-        """Irradiance / pi (n_v, 3) of light of lamps that was reflected at least once before."""
+        """Irradiance / pi (k, n_v, 3) of light of lamps that met some, and at most 0, 1, ... surfaces; k may be 1."""
         lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
         settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed")}
         settings["method"] = "brute_force" if by_paths else "auto"
         settings["spp"] = settings["spp"] or LAMP_SPP
         transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)
-        return transport.operators["indirect"].relight(lamps.brightness)
+        found = transport.irradiance_by_depth(lamps.brightness)
+        apart = bool(transport.operators["indirect"].by_depth)
+        return np.concatenate([np.zeros_like(found[:1]), found]) if apart else found
 
     def to_string(self) -> str:
         return f"SparsePRT[lighting = {self._lighting!r}, settings = {self._settings}]"

@@ -122,16 +122,18 @@ class LampPaths(PathSolver):
         Whose emission space is sampled.
     spp, seed : int
         As for ``PathSolver``.
+    apart : int
+        Of light that met 1, 2, ... surfaces, so many numbers: three channels of each, (m, 3 * apart).
     """
 
-    def __init__(self, problem: Problem, spp: int = 64, seed: int = 0) -> None:
+    def __init__(self, problem: Problem, spp: int = 64, seed: int = 0, apart: int = 1) -> None:
         self.problem, self.scene, self.points = problem, problem.scene.unsplit, problem.points
         self.spp, self.seed = spp, seed
-        self.max_depth, self.channels = problem.max_depth, 3
+        self.max_depth, self.channels, self._apart = problem.max_depth, 3 * apart, apart
         self._world, self._emission = problem.scene, problem.emission
         self._points = PointArrays(problem.points)
 
-    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
+    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> list[mi.Float]:
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
 
         def sample(si: mi.SurfaceInteraction3f, rng: mi.PCG32) -> tuple[Any, Any, Any, Any]:
@@ -150,7 +152,8 @@ class LampPaths(PathSolver):
         light = Light(sample, scattered=True, rough_glass=self._world.rough_glass)
         if has_mirrors(self.scene) or len(self._emission.unmet) < self._emission.size:
             light.met = met
-        return trace_reflected(self.scene, ray, light, rng, bounces)
+        found = trace_reflected(self.scene, ray, light, rng, bounces, self._apart)
+        return [channel for colour in found for channel in colour]
 
 
 def light_by_paths(
@@ -160,8 +163,9 @@ def light_by_paths(
     spp: int,
     seed: int,
     ticks: Callable[[int], None] = lambda _: None,
-) -> tuple[Floats, int]:
-    """Indirect light (m, 3) of listed elements by some paths of each, more where these spread, and how many these were.
+    apart: int = 1,
+) -> tuple[Estimate, int]:
+    """Indirect light of listed elements by some paths of each, more where these spread, and how many these were.
 
     A few paths more tell how far those of an element spread, and half as many as all are shared out in proportion to
     that (Neyman 1934): near a lamp, a few elements have most of the noise. What is found does not depend on the first.
@@ -176,23 +180,27 @@ def light_by_paths(
     seed : int
     ticks : callable, optional
         Is told of elements that are done.
+    apart : int
+        As of ``LampPaths``: estimates are (m, 3 * apart).
     """
-    m, result = len(point_ids), np.zeros((len(point_ids), 3), np.float32)
+    m = len(point_ids)
+    mean, variance = np.zeros((m, 3 * apart), np.float32), np.zeros((m, 3 * apart), np.float32)
     counts, traced = np.full(m, spp), 0
     pilot, main = element_seeds(random_stream(seed, SHARED_OUT), 2)
     if spp >= PILOT**2:
         first = LampPaths(problem, spp // PILOT, pilot)
         power = np.square(problem.reflection.albedo[point_ids].astype(np.float64))
-        variance = first.elements(point_ids, columns).variance
-        counts = shared_out(first.spp * (power * variance).sum(axis=1), first.spp, spp)
+        spread = first.spp * (power * first.elements(point_ids, columns).variance).sum(axis=1)
+        counts = shared_out(spread, first.spp, spp)
         traced = m * first.spp
     for count in np.unique(counts):
-        those, paths = np.flatnonzero(counts == count), LampPaths(problem, int(count), main)
+        those, paths = np.flatnonzero(counts == count), LampPaths(problem, int(count), main, apart)
         for a in range(0, len(those), paths.block_elements):
             some = those[a : a + paths.block_elements]
-            result[some] = paths.elements(point_ids[some], columns[some]).mean
+            block = paths.elements(point_ids[some], columns[some])
+            mean[some], variance[some] = block.mean, block.variance
             ticks(len(some))
-    return result, traced + int(counts.sum())
+    return Estimate(mean, variance), traced + int(counts.sum())
 
 
 def shared_out(squares: NDArray[np.float64], seen: int, least: int) -> NDArray[np.int64]:

@@ -157,21 +157,20 @@ class PathSolver:
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         return start_ray(self._points, point, mi.Frame3f(self._points.normal(point)).to_world(local))
 
-    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:
+    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: list[mi.Float]) -> list[mi.Float]:
         """One sample per channel of (1/pi) times the irradiance at points, by the radiance that their first rays find.
 
         These are cosine-distributed, which makes it the mean of that radiance, wherever they go.
         """
-        return [radiance[c] for c in range(self.channels)]
+        return radiance[: self.channels]
 
-    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> mi.Color3f:
-        """One sample of the radiance that first rays find on other surfaces, per d_omega."""
+    def _radiance(self, ray: mi.Ray3f, texel: mi.UInt32, rng: mi.PCG32) -> list[mi.Float]:
+        """One sample of the radiance that first rays find on other surfaces, per d_omega, one for each channel."""
         bounces = dr.opaque(mi.UInt32, self.max_depth - 2 if self.max_depth >= 0 else 1 << 31)
         apart = self.problem.specular_apart
         if self.basis == "direction" and not apart:
-            return trace_reflected(
-                self.scene, ray, Light(distant(self._texels.centre(texel), mi.Float(1))), rng, bounces
-            )
+            light = Light(distant(self._texels.centre(texel), mi.Float(1)))
+            return list(trace_reflected(self.scene, ray, light, rng, bounces)[0])
         # Radiance 1 over the texel: each path sees its own direction in it, weighted to 1 on average.
         mean = self._texels.solid_angle(texel)
         if self.basis == "direction":
@@ -183,7 +182,7 @@ class PathSolver:
         if has_mirrors(self.scene) or apart:
             inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
             light = Light(shadow, inside, 1 / mean, apart, self.problem.scene.rough_glass)
-        return trace_reflected(self.scene, ray, light, rng, bounces)
+        return list(trace_reflected(self.scene, ray, light, rng, bounces)[0])
 
 
 @dataclass
@@ -229,15 +228,21 @@ def has_mirrors(scene: mi.Scene | TracedScene) -> bool:
 
 @dr.syntax
 def trace_reflected(
-    scene: mi.Scene | TracedScene, ray: mi.Ray3f, light: Light, rng: mi.PCG32, bounces: mi.UInt32
-) -> mi.Color3f:
+    scene: mi.Scene | TracedScene,
+    ray: mi.Ray3f,
+    light: Light,
+    rng: mi.PCG32,
+    bounces: mi.UInt32,
+    apart: int = 1,
+) -> list[mi.Color3f]:
     """Radiance along a ray from the surfaces of a scene under one light, direct light on the ray itself left out.
 
-    Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most.
+    Follows Mitsuba's ``path``: at each surface one shadow ray, then a BSDF sample; ``bounces`` surfaces at most. Of
+    light that met 1, 2, ... surfaces, ``apart`` numbers; that which met more belongs to the last.
     """
     context = mi.BSDFContext()
     ray = mi.Ray3f(ray)
-    result, throughput = mi.Color3f(0), mi.Color3f(1)
+    result, throughput = [mi.Color3f(0) for _ in range(apart)], mi.Color3f(1)
     depth = mi.UInt32(0)
     mirrored, counts, density = mi.Mask(False), mi.Mask(not light.scattered), mi.Float(0)
     active = mi.Mask(depth < bounces)
@@ -245,12 +250,14 @@ def trace_reflected(
         si = scene.ray_intersect(ray, active)
         if light.contains is not None:
             escaped = active & mirrored & counts & ~si.is_valid()
-            result += dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
+            found = dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
+            result = added(result, depth, found)
         if light.met is not None:
             meets = active & counts & (depth > 0)
             radiance, sampled = light.met(si, ray, meets)
             share = dr.select(mirrored | (sampled == 0), 1, density / (density + sampled))
-            result += dr.select(meets & ~dr.all(radiance == 0), throughput * radiance * share, 0)
+            found = dr.select(meets & ~dr.all(radiance == 0), throughput * radiance * share, 0)
+            result = added(result, depth, found)
         active &= si.is_valid() & (depth < bounces)
 
         # Light, from one direction
@@ -271,7 +278,7 @@ def trace_reflected(
         lit &= ~scene.ray_test(shadow, lit)
         if light.met is not None:
             irradiance *= dr.select(chance > 0, chance / (chance + other), 1)
-        result += dr.select(lit, throughput * value * irradiance, 0)
+        result = added(result, depth + 1, dr.select(lit, throughput * value * irradiance, 0))
 
         # Next surface
         depth += 1
@@ -290,3 +297,14 @@ def trace_reflected(
         active &= rng.next_float32() < survival
         throughput /= survival
     return result
+
+
+def added(result: list[mi.Color3f], met: mi.UInt32, light: mi.Color3f) -> list[mi.Color3f]:
+    """Light that met 1, 2, ... surfaces, and more of it that met some number."""
+    last = len(result)
+    if last == 1:
+        return [result[0] + light]
+    return [
+        whole + dr.select((met == k) if k < last else (met >= k), light, 0)
+        for k, whole in enumerate(result, 1)
+    ]

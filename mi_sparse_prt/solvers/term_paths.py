@@ -41,7 +41,7 @@ class TermPaths(PathSolver):
         self.colours, self.channels = problem.channels, (1 + problem.reflection.terms) * problem.channels
         self._lobes = Lobes(problem.reflection)
 
-    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: mi.Color3f) -> list[mi.Float]:
+    def _weighted(self, point: mi.UInt32, direction: mi.Vector3f, radiance: list[mi.Float]) -> list[mi.Float]:
         weights = [mi.Float(1), *self._lobes.incident(point, direction)]
         return [weight * radiance[c] for weight in weights for c in range(self.colours)]
 

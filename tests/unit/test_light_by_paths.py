@@ -1,5 +1,7 @@
 """Indirect light of lamps: where paths spread there are more of them, and near lamps are met by chance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import T, build
@@ -76,7 +78,7 @@ def test_more_paths_where_they_spread(problem):
     asked = elements(problem)
     truth = LampPaths(problem, 4096, 99).elements(*asked)
     runs, counts = zip(*(light_by_paths(problem, *asked, 64, seed) for seed in range(16)), strict=True)
-    sums = np.array([run.sum() for run in runs], np.float64)
+    sums = np.array([run.mean.sum() for run in runs], np.float64)
     known, error = float(truth.mean.sum()), sums.std(ddof=1) / 4
     error = np.hypot(error, np.sqrt(float(truth.variance.sum()) * 3))
     assert error < 0.005 * known
@@ -85,7 +87,7 @@ def test_more_paths_where_they_spread(problem):
     assert 64 < per_element < 150
     even = LampPaths(problem, round(per_element), 3).elements(*asked)
     power = problem.reflection.albedo[asked[0]] ** 2
-    noise = np.mean([(power * (run - truth.mean) ** 2).sum() for run in runs])
+    noise = np.mean([(power * (run.mean - truth.mean) ** 2).sum() for run in runs])
     print(per_element, noise / float((power * even.variance).sum()))
     assert noise < 0.95 * float((power * even.variance).sum())
 
@@ -104,7 +106,21 @@ def test_how_paths_are_shared_out():
 
 def test_same_seed_same_light(problem):
     asked = elements(problem)
-    first, again = (light_by_paths(problem, *asked, 64, 5)[0] for _ in "ab")
+    first, again = (light_by_paths(problem, *asked, 64, 5)[0].mean for _ in "ab")
     np.testing.assert_array_equal(first, again)
     some = asked[0][::-1], asked[1][::-1]  # in another order
-    np.testing.assert_array_equal(light_by_paths(problem, *some, 64, 5)[0][::-1], first)
+    np.testing.assert_array_equal(light_by_paths(problem, *some, 64, 5)[0].mean[::-1], first)
+
+
+def test_light_apart_by_depth_is_all_light(problem):
+    """Expected: light that met 1, 2 and 3 surfaces sums to all of it, and what met at most k is that of a lower
+    ``max_depth``: of the same paths, but for what roulette ends, of which there is none before the fifth bounce."""
+    asked = elements(problem)
+    apart = LampPaths(problem, 64, 5, apart=3).elements(*asked).mean.reshape(-1, 3, 3)
+    for most, depth in ((1, 3), (2, 4), (3, 5)):
+        lower = replace(problem, max_depth=depth)
+        whole = LampPaths(lower, 64, 5).elements(*asked).mean
+        np.testing.assert_allclose(apart[:, :most].sum(axis=1), whole, rtol=1e-4, atol=1e-6)
+    two = LampPaths(problem, 64, 5, apart=2).elements(*asked).mean.reshape(-1, 2, 3)
+    np.testing.assert_allclose(two[:, 1], apart[:, 1:].sum(axis=1), rtol=1e-4, atol=1e-6)
+    assert apart.sum(axis=(0, 2)).min() > 0.01 * apart.sum()  # each depth has some
