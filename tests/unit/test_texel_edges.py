@@ -240,6 +240,35 @@ def test_a_disk_before_the_sky(radius):
     assert 0 < np.sum(ours) / np.sum(np.abs(centres)) < 0.15
 
 
+def gravel(share: float, seed: int, fine: float = 90.0):
+    """A sky of small open pieces at random, cubes of 1/90 cut the sphere into them, that are a share of it."""
+
+    def open_at(d: mi.Vector3f) -> mi.Mask:
+        at = mi.Vector3i(dr.floor(d * fine))
+        mixed = mi.UInt32(at.x) * 73856093 ^ mi.UInt32(at.y) * 19349663 ^ mi.UInt32(at.z) * 83492791
+        return mi.sample_tea_float32(mixed, mi.UInt32(seed)) < share
+
+    return open_at
+
+
+@pytest.mark.parametrize("share", [0.1, 0.9], ids=["specks", "holes"])
+def test_what_is_finer_than_texels_does_not_get_lost(share):
+    """Rationale: a speck has a centre in it as often as its area says; if it then counts by its area, most is lost.
+
+    Expected: over 40 skies of open specks, or of dark ones, four fifths of them are there: where two centres beside
+    each other are in specks, these are taken for one of their true width.
+    Result: 86 and 87%; if all count by their area, 12%.
+    """
+
+    skies = [Sky(16, gravel(share, seed)) for seed in range(40)]
+    own = [fractional_visibility(sky, sky.bits)[0].rows(np.arange(1))[0, :, 0].sum() for sky in skies]
+    exact = [sky.exact().sum() for sky in skies]
+    rare = lambda x: np.mean(x) if share < 0.5 else 1 - np.mean(x)  # noqa: E731
+    ratio = float(rare(own) / rare(exact))
+    print(ratio)
+    assert 0.8 < ratio < 1.05
+
+
 @pytest.mark.parametrize("n", [1, 2, 4, 8, 32])
 def test_an_open_and_a_closed_sky(n):
     """No ray, no list. All light together is 1 if there is any: a white point under radiance 1."""
