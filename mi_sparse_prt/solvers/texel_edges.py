@@ -55,6 +55,17 @@ class Crossings(NamedTuple):
     places: NDArray[np.float32]
 
 
+class _Room(NamedTuple):
+    """Memory that the vertices of a thread share: of pairs, where visibility changes; of texels, for which vertex
+    they were touched and known last, and their areas."""
+
+    moved: NDArray[np.float32]
+    touched: NDArray[np.int64]
+    known: NDArray[np.int64]
+    areas: NDArray[np.float32]
+    wide: NDArray[np.float32]
+
+
 def fractional_visibility(direct: DirectSolver, bits: Bits) -> tuple[FractionalVisibility, int]:
     """Visible areas of all texels, from the visibility of their centres and a few more rays along its edges.
 
@@ -153,56 +164,79 @@ def _find_shares(
 
     Texels that the horizon may cut, their centres below it, are seen as those around them are; ``seen`` says so.
     """
-    # where visibility changes between the texels of each pair, and for which vertex each texel was cut last
-    edge, moved = np.full(len(sides.first), -1.0, np.float32), np.full(len(sides.first), -1.0, np.float32)
-    done, touched = np.full(len(sides.beside), -1, np.int64), np.full(len(sides.beside), -1, np.int64)
-    areas, wide = np.zeros(len(done), np.float32), np.zeros(len(done), np.float32)
+    # where visibility changes between the texels of each pair, and for which vertex each texel was listed last
+    edge = np.full(len(sides.first), -1.0, np.float32)
+    done = np.full(len(sides.beside), -1, np.int64)
+    shared = _Room(
+        edge.copy(),
+        done.copy(),
+        done.copy(),
+        np.zeros(len(done), np.float32),
+        np.zeros(len(done), np.float32),
+    )
     for i in range(start, end):
-        at, own = room[i], range(crossings.starts[i], crossings.starts[i + 1])
-        for e in own:
-            edge[crossings.pairs[e]] = crossings.places[e]
-        change, square = 0.0, 0.0
-        for e in own:
-            pair = crossings.pairs[e]
-            moved[pair] = _widened(sides, edge, pair, sides.first[pair], sides.second[pair])
-            if moved[pair] != edge[pair]:
-                for texel in sides.around[pair]:
-                    if texel >= 0:
-                        touched[texel] = i
-        for e in own:
-            for texel in sides.around[crossings.pairs[e]]:
+        at, pairs = room[i], crossings.pairs[crossings.starts[i] : crossings.starts[i + 1]]
+        edge[pairs] = crossings.places[crossings.starts[i] : crossings.starts[i + 1]]
+        areas = _areas(sides, bits[i], above[i], edge, pairs, i, shared)
+        for pair in pairs:
+            for texel in sides.around[pair]:
                 if texel >= 0 and done[texel] != i and bit_of(above[i], texel):
                     done[texel] = i
-                    areas[texel] = _area(sides, bits[i], above[i], edge, texel)
-                    wide[texel] = areas[texel]
-                    if touched[texel] == i:
-                        wide[texel] = np.float32(bit_of(bits[i], texel))
-                        if not _is_speck(sides, edge, texel):
-                            wide[texel] = _area(sides, bits[i], above[i], moved, texel)
-                        change += wide[texel] - areas[texel]
-                        square += (wide[texel] - areas[texel]) ** 2
-        found = wide if change * change > MANY * square else areas
-        for e in own:
-            for texel in sides.around[crossings.pairs[e]]:
-                if texel >= 0 and done[texel] == i:
-                    done[texel] = -2 - i
-                    at = _listed(texel, found[texel], bit_of(bits[i], texel), entries, at)
+                    at = _listed(texel, areas[texel], bit_of(bits[i], texel), entries, at)
         for w in range(horizon.shape[1]):
             left = horizon[i, w]
             while left:
                 pair = w * BITS + np.int64(lowest_bit(left))  # type: ignore[call-arg]  # numba gives the context
                 left &= left - np.uint32(1)
                 texel = sides.second[pair] if bit_of(above[i], sides.first[pair]) else sides.first[pair]
-                if done[texel] != -2 - i:
-                    done[texel] = -2 - i
+                if done[texel] != i:
+                    done[texel] = i
                     share = _mean_around(sides, bits[i], above[i], texel)
                     whole = np.uint32(share > 0.5)
                     seen[i, texel // BITS] |= whole << np.uint32(texel % BITS)
                     at = _listed(texel, share, whole, entries, at)
         entries[room[i] : at].sort()
         number[i] = at - room[i]
-        for e in own:
-            edge[crossings.pairs[e]] = moved[crossings.pairs[e]] = -1.0
+        edge[pairs] = -1.0
+
+
+@numba.njit
+def _areas(
+    sides: Sides,
+    bits: Bits,
+    above: Bits,
+    edge: NDArray[np.float32],
+    pairs: NDArray[np.uint32],
+    vertex: int,
+    room: _Room,
+) -> NDArray[np.float32]:
+    """Visible shares (n_directions,) of the texels around pairs of a vertex; what others have is of no account.
+
+    As they are traced; or, if that changes their sum by more than chance, what is narrower than a texel one texel wide.
+    """
+    change, square = 0.0, 0.0
+    for pair in pairs:
+        room.moved[pair] = _widened(sides, edge, pair, sides.first[pair], sides.second[pair])
+        if room.moved[pair] != edge[pair]:
+            for texel in sides.around[pair]:
+                if texel >= 0:
+                    room.touched[texel] = vertex
+    for pair in pairs:
+        for texel in sides.around[pair]:
+            if texel < 0 or room.known[texel] == vertex or not bit_of(above, texel):
+                continue
+            room.known[texel] = vertex
+            area = wide = _area(sides, bits, above, edge, texel)
+            if room.touched[texel] == vertex:
+                wide = float(bit_of(bits, texel))
+                if not _is_speck(sides, edge, texel):
+                    wide = _area(sides, bits, above, room.moved, texel)
+                change += wide - area
+                square += (wide - area) ** 2
+            room.areas[texel], room.wide[texel] = area, wide
+    for pair in pairs:
+        room.moved[pair] = -1.0
+    return room.wide if change * change > MANY * square else room.areas
 
 
 @numba.njit
