@@ -16,7 +16,7 @@ from mi_sparse_prt.transport import LightTransport
 
 POINTS = 256  # of each group, at most
 ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has fewer points
-SPP = 64
+SPP = 256  # of 64, those of a lamp behind glass told an error of 0
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 
 Doubles: TypeAlias = NDArray[np.float64]

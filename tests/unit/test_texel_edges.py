@@ -241,7 +241,7 @@ def test_a_disk_before_the_sky(radius):
 
 
 def gravel(share: float, seed: int, fine: float = 90.0):
-    """A sky of small open pieces at random, cubes of 1/90 cut the sphere into them, that are a share of it."""
+    """A sky cut into pieces by a grid of cubes, so many to a unit; at random a share of them is open."""
 
     def open_at(d: mi.Vector3f) -> mi.Mask:
         at = mi.Vector3i(dr.floor(d * fine))
