@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -97,7 +98,7 @@ class FirstBounce:
 
 
 def first_bounce(
-    matrix: StackedFormFactors,
+    matrices: Sequence[StackedFormFactors],
     albedo: Floats,
     lights: Sequence[Operator],
     keys: NDArray[np.uint64],
@@ -110,8 +111,8 @@ def first_bounce(
 
     Parameters
     ----------
-    matrix : StackedFormFactors (n, n_v)
-        G.
+    matrices : sequence of StackedFormFactors (n, n_v)
+        G of each channel, or one of all.
     albedo : (channels, n_v) float32
     lights : sequence of Operator
         D of each channel, or one of all.
@@ -130,7 +131,7 @@ def first_bounce(
     """
     rng = np.random.default_rng(seed)
     hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrix, albedo, lights, weights, hashes, rng, tolerance, options)
+    columns, turn, missed = _basis(matrices, albedo, lights, weights, hashes, rng, tolerance, options)
     count = options.row_count(turn.shape[1], len(keys))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
@@ -138,7 +139,7 @@ def first_bounce(
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
     if weights is not None:
         fit *= weights[rows]
-    right = [fit @ known for known in _rows(matrix.rows(rows), albedo, lights)]
+    right = [fit @ known for known in _rows([m.rows(rows) for m in matrices], albedo, lights)]
     found = _truncated(columns, turn, right, missed, tolerance)
     if weights is None:
         return found
@@ -146,7 +147,7 @@ def first_bounce(
 
 
 def _basis(
-    matrix: StackedFormFactors,
+    matrices: Sequence[StackedFormFactors],
     albedo: Floats,
     lights: Sequence[Operator],
     weights: Floats | None,
@@ -169,12 +170,14 @@ def _basis(
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
     draws, width = max(1, options.draws // len(albedo)), min(BITS, lights[0].shape[1])
-    mixed = np.empty((matrix.shape[1], draws * width), np.float32)
+    mixed = np.empty((matrices[0].shape[1], draws * width), np.float32)
     while True:
-        block = _combinations(matrix, albedo, lights, mixed, options.mixed, rng)
+        found = _combinations(matrices, albedo, lights, mixed, options.mixed, rng)
         if weights is not None:
-            block *= weights[:, None]
-        new = (block if shorten is None else multiply_sparse(shorten, block)).astype(np.float64)
+            for block in found:
+                block *= weights[:, None]
+        sums = found if shorten is None else [multiply_sparse(shorten, block) for block in found]
+        new = np.hstack(sums).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
         # [vector, combination]
         known = turn.T @ np.concatenate([np.zeros((0, new.shape[1])), *products[:-1]])
@@ -182,14 +185,14 @@ def _basis(
         energies.append(np.trace(products[-1]))
         energy = max(float(np.mean(energies)), 1e-30)
         missed = max(float(np.trace(rest)), 0) / energy
-        missed *= options.amplification(len(known), len(block), len(new))
+        missed *= options.amplification(len(known), len(hashes), len(new))
         squares, vectors = np.linalg.eigh(rest)
         kept = squares > (PRECISION / 2) ** 2 * energy
         if missed <= options.share * tolerance**2 or not kept.any() or len(known) >= options.most:
-            return blocks or [block[:, :0]], turn, missed
+            return blocks or [found[0][:, :0]], turn, missed
         steps = vectors[:, kept] / np.sqrt(squares[kept])
         turn = np.block([[turn, -turn @ (known @ steps)], [np.zeros((len(steps), turn.shape[1])), steps]])
-        blocks.append(block)
+        blocks += found
         short.append(new)
 
 
@@ -205,23 +208,23 @@ def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | No
 
 
 def _combinations(
-    matrix: StackedFormFactors,
+    matrices: Sequence[StackedFormFactors],
     albedo: Floats,
     lights: Sequence[Operator],
     mixed: Floats,
     few: int,
     rng: np.random.Generator,
-) -> Floats:
-    """Sums of a few random columns each, with random signs, of each channel in turn: (n, combinations).
+) -> list[Floats]:
+    """Sums of a few random columns each, with random signs: (n, combinations) of each channel.
 
     ``mixed`` (n_v, combinations of a channel) is overwritten.
     """
     found, width = [], min(BITS, lights[0].shape[1])
     for c, rho in enumerate(albedo):
         for a in range(0, mixed.shape[1], width):
-            combine_randomly(lights[min(c, len(lights) - 1)], few, rng, mixed[:, a : a + width])
-        found.append(matrix.reflect(rho[None], mixed)[0])
-    return found[0] if len(found) == 1 else np.hstack(found)
+            combine_randomly(of_channel(lights, c), few, rng, mixed[:, a : a + width])
+        found.append(of_channel(matrices, c).reflect(rho[None], mixed)[0])
+    return found
 
 
 def _leverage(columns: list[Floats], turn: Doubles, projections: int, rng: np.random.Generator) -> Doubles:
@@ -263,18 +266,27 @@ def _chosen_rows(
     return rows, -np.expm1(-rate[rows] * arrival[order[count]])
 
 
-def _rows(matrix: scipy.sparse.csr_array, albedo: Floats, lights: Sequence[Operator]) -> Floats:
+def _rows(matrices: Sequence[scipy.sparse.csr_array], albedo: Floats, lights: Sequence[Operator]) -> Floats:
     """G rho D (channels, s, n_directions) for some rows (s, n_v) of G, from those rows of D that they touch."""
-    touched, columns = np.unique(matrix.indices, return_inverse=True)
-    shape = matrix.shape[0], len(touched)
-    local = scipy.sparse.csr_array((matrix.data, columns.astype(np.int32), matrix.indptr), shape=shape)
-    result = np.empty((len(albedo), shape[0], lights[0].shape[1]), np.float32)
+    touched = np.unique(np.concatenate([matrix.indices for matrix in matrices]))
+    local = [_at_columns(matrix, touched) for matrix in matrices]
+    rho = np.ascontiguousarray(albedo[:, touched])
+    result = np.empty((len(albedo), local[0].shape[0], lights[0].shape[1]), np.float32)
+    if len(lights) == len(matrices) == 1:  # each row of the light is read once for all channels
+        for texels, light in ColumnBlocks(lights[0].take(touched)):
+            result[..., texels] = multiply_scaled(local[0], rho, light)
+        return result
     for c, direct in enumerate(lights):
-        own = slice(c, c + 1) if len(lights) > 1 else slice(None)
-        rho = np.ascontiguousarray(albedo[own][:, touched])
         for texels, light in ColumnBlocks(direct.take(touched)):
-            result[own][..., texels] = multiply_scaled(local, rho, light)
+            for k in (c,) if len(lights) > 1 else range(len(albedo)):
+                result[k, :, texels] = multiply_scaled(of_channel(local, k), rho[k : k + 1], light)[0]
     return result
+
+
+def _at_columns(matrix: scipy.sparse.csr_array, columns: NDArray[np.integer]) -> scipy.sparse.csr_array:
+    """Some columns, by ascending numbers, with all that a matrix holds."""
+    places = np.searchsorted(columns, matrix.indices).astype(np.int32)
+    return scipy.sparse.csr_array((matrix.data, places, matrix.indptr), shape=(matrix.shape[0], len(columns)))
 
 
 def _truncated(
@@ -292,6 +304,11 @@ def _truncated(
         tuple(u.T @ b for u, b in zip(turns, right, strict=True)),
         float(np.sqrt(missed + dropped / max(energy, 1e-30))),
     )
+
+
+def of_channel(each: Sequence[Any] | NDArray[Any], channel: int) -> Any:
+    """That of one channel; the only one is that of all."""
+    return each[min(channel, len(each) - 1)]
 
 
 def all_but_least(energies: Sequence[NDArray[np.floating]], expendable: float) -> list[NDArray[np.bool_]]:

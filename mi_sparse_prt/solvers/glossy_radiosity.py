@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
-from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.solvers.glossy_rays import Noise, gather_matrix, gather_rays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import (
@@ -44,15 +42,15 @@ Floats = NDArray[np.float32]
 
 
 class GlossyGather(FiniteElements):
-    """Indirect light of one channel at the vertices of a scene and of the terms of its glossy ones.
+    """Indirect light at the vertices of a scene and of the terms of its glossy ones.
 
     Rows are numbered as in ``FactoredVisibility``.
 
     Parameters
     ----------
-    matrices : sequence of (n_nodes, n) sparse float32
+    matrices : sequence of sequences of (n_nodes, n) sparse float32
         As for ``FiniteElements``.
-    albedo : (n,) float32
+    albedo : (channels, n) float32
         Of the diffuse part of each vertex; 1 for terms.
     problem : Problem
     direct : FactoredVisibility
@@ -65,7 +63,7 @@ class GlossyGather(FiniteElements):
 
     def __init__(
         self,
-        matrices: Sequence[scipy.sparse.csr_array],
+        matrices: Sequence[Sequence[scipy.sparse.csr_array]],
         albedo: Floats,
         problem: Problem,
         direct: FactoredVisibility,
@@ -76,7 +74,7 @@ class GlossyGather(FiniteElements):
         points = problem.points
         term = np.tile(np.arange(1, direct.terms + 1), len(direct.glossy)).astype(np.uint64)
         keys = [points.keys, mix(np.repeat(points.keys[direct.glossy], direct.terms) + term)]
-        super().__init__(matrices, albedo[None], np.concatenate(keys), nodes, problem.max_depth, seed)
+        super().__init__(matrices, albedo, np.concatenate(keys), nodes, problem.max_depth, seed)
         self._visibility = direct.visibility
         self.weights = np.maximum(weights[nodes.ids], LEAST_WEIGHT * weights.max())
 
@@ -89,13 +87,12 @@ class GlossyGather(FiniteElements):
 
     def bounces(self, even: Floats) -> int:
         """How many interreflections count for anything; terms may be negative, so that this is no strict bound."""
-        total, count, light = 0.0, 0, even[:, None]
+        total, count, light = 0.0, 0, self._gathered(even[:, None])
         while count < (self.max_depth - 2 if self.max_depth >= 0 else MOST_BOUNCES):
-            found = self.matrix @ (self._albedo[0][:, None] * light)
-            peak = float(np.abs(found).max(initial=0))
+            peak = max(float(np.abs(x).max(initial=0)) for x in light)
             if peak <= NEGLIGIBLE * total or peak == 0:
                 break
-            count, total, light = count + 1, total + peak, self.nodes.interpolate(found)
+            count, total, light = count + 1, total + peak, self._reflected(light)
         return count
 
 
@@ -136,47 +133,20 @@ def glossy_indirect(
         mirrors and glass reaches unit-albedo rows, and of glossy surfaces as far as these are diffuse.
     """
     assert isinstance(problem.reflection, InOutFactors)
-    albedo, outgoing = _channels(problem.reflection, 1 if specular is None else specular.shape[2])
-    ones = np.ones(direct.shape[0] - len(albedo), np.float32)
+    albedo, outgoing = _channels(problem.reflection)
     points = np.union1d(nodes.ids, direct.glossy)
     rays = gather_rays(problem, outgoing, rays_per_vertex, seed, points)
     noise = rays.noise(direct, problem.reflection, problem.points, seed)
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))
     rows = nodes_and_terms(nodes, direct)
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
-    found = []
-    for channel, shade in enumerate(albedo.T):
-        matrices = [gather_matrix(direct, rays, channel, nodes.ids), *after_mirrors]
-        weights = problem.reflection.row_weights[:, channel]
-        solver = GlossyGather(matrices, np.concatenate([shade, ones]), problem, direct, rows, weights, seed)
-        own = None if specular is None else _channel(specular, channel)
-        found.append(solver.indirect(direct, tolerance, own))
-    return _joined(found), noise
-
-
-def _channel(specular: SparseRows | ByDepth, number: int) -> Operator:
-    """One of three channels alone."""
-    if isinstance(specular, ByDepth):
-        return ByDepth(tuple(t.channel(number) for t in specular.terms if isinstance(t, SparseRows)))
-    return specular.channel(number)
-
-
-def _joined(found: list[Gathered | GatheredByDepth]) -> Gathered | GatheredByDepth:
-    """Light of several channels, each of which was found on its own."""
-    by_depth = [f for f in found if isinstance(f, GatheredByDepth)]
-    if by_depth:
-        terms = (
-            LowRank(tuple(t.left[0] for t in some), tuple(t.right[0] for t in some))
-            for some in zip(*(f.terms for f in by_depth), strict=True)
-        )
-        return GatheredByDepth(tuple(terms), max(f.left_out for f in by_depth))
-    summed = [f for f in found if isinstance(f, Gathered)]
-    return Gathered(
-        tuple(f.left[0] for f in summed),
-        tuple(f.right[0] for f in summed),
-        max(f.left_out for f in summed),
-        max(f.bounces for f in summed),
-    )
+    matrices = [
+        [gather_matrix(direct, rays, channel, nodes.ids), *after_mirrors] for channel in range(len(outgoing))
+    ]
+    of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
+    every, weights = np.hstack([albedo, of_terms]), problem.reflection.row_weights.mean(axis=1)
+    solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)
+    return solver.indirect(direct, tolerance, specular), noise
 
 
 def _after_mirrors(
@@ -191,10 +161,9 @@ def _after_mirrors(
     return matrices
 
 
-def _channels(reflection: Reflection, least: int) -> tuple[Floats, Floats]:
-    """Albedos (n_v, channels) and g_k (channels, ...); one channel where all are alike and ``least`` is no more."""
-    assert isinstance(reflection, InOutFactors)
+def _channels(reflection: InOutFactors) -> tuple[Floats, Floats]:
+    """Albedos (channels, n_v) and g_k (channels, ...); one channel where all are alike."""
     albedo, outgoing = reflection.albedo, outgoing_tables(reflection.factors)
     grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
-    count = least if grey else 3
-    return np.ascontiguousarray(albedo[:, :count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])
+    count = 1 if grey else 3
+    return np.ascontiguousarray(albedo.T[:count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

@@ -34,7 +34,13 @@ from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.operators.sum import Sum
-from mi_sparse_prt.solvers.first_bounce import FirstBounce, RandomBasis, all_but_least, first_bounce
+from mi_sparse_prt.solvers.first_bounce import (
+    FirstBounce,
+    RandomBasis,
+    all_but_least,
+    first_bounce,
+    of_channel,
+)
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular_chains import specular_form_factors
@@ -110,9 +116,9 @@ class FiniteElements:
 
     Parameters
     ----------
-    matrices : sequence of (n_nodes, n) sparse float32
-        G_0, G_1, ...: form factors after so many specular surfaces; where light is not told apart by depth, only their
-        sum counts.
+    matrices : sequence of sequences of (n_nodes, n) sparse float32
+        G_0, G_1, ... of each channel, or of all: form factors after so many specular surfaces; where light is not told
+        apart by depth, only their sum counts.
     albedo : (channels, n) float32
     keys : (n,) uint64
         Random numbers are made of them.
@@ -126,7 +132,7 @@ class FiniteElements:
     Attributes
     ----------
     matrix : (n_nodes, n) sparse float32
-        G, the sum of all.
+        G, the sum of all; of the first channel, if each has its own.
     options : LowRankOptions
     weights : (n_nodes,) float32 or None
         What errors of rows count by in a low rank, above 0; None where all are alike.
@@ -136,7 +142,7 @@ class FiniteElements:
 
     def __init__(
         self,
-        matrices: Sequence[scipy.sparse.csr_array],
+        matrices: Sequence[Sequence[scipy.sparse.csr_array]],
         albedo: Floats,
         keys: NDArray[np.uint64],
         nodes: Nodes,
@@ -147,10 +153,17 @@ class FiniteElements:
         self.max_depth, self.seed = max_depth, seed
         self.channels, self.options = len(albedo), LowRankOptions()
 
-    @cached_property
+    @property
     def matrix(self) -> scipy.sparse.csr_array:
-        first, *others = self._matrices
-        return scipy.sparse.csr_array(sum(others, first)) if others else first
+        return self._sums[0]
+
+    @cached_property
+    def _sums(self) -> list[scipy.sparse.csr_array]:
+        """G of each channel, or of all."""
+        return [
+            scipy.sparse.csr_array(sum(others, first)) if others else first
+            for first, *others in self._matrices
+        ]
 
     def apply(self, columns: Floats) -> Floats:
         """Indirect light under a few lights, without approximation.
@@ -169,7 +182,7 @@ class FiniteElements:
         count = self.bounces(columns.sum(axis=1))
         for a in range(0, columns.shape[1] if count else 0, COLUMNS):
             part = slice(a, a + COLUMNS)
-            light = list(multiply_scaled(self.matrix, self._albedo, columns[:, part]))
+            light = self._gathered(columns[:, part])
             totals = light
             for _ in range(count - 1):
                 light = self._reflected(light)
@@ -182,11 +195,10 @@ class FiniteElements:
         result = np.zeros_like(columns)
         count = self.bounces(columns.sum(axis=1).max(axis=1))
         for c in range(3 if count else 0):
-            rho = self._albedo[min(c, self.channels - 1)][None]
-            light = multiply_scaled(self.matrix, rho, np.ascontiguousarray(columns[..., c]))[0]
+            light = self._reflect_one(c, np.ascontiguousarray(columns[..., c]))
             total = light.copy()
             for _ in range(count - 1):
-                light = multiply_scaled(self.matrix, rho, self.nodes.interpolate(light))[0]
+                light = self._reflect_one(c, self.nodes.interpolate(light))
                 total += light
             result[..., c] = self.nodes.interpolate(total)
         return result
@@ -206,28 +218,27 @@ class FiniteElements:
             Unit-albedo indirect transport.
         """
         count = self._count_for(direct)
-        totals = [self._adjoint(rho, np.asarray(ids), count) for rho in self._albedo]
+        totals = [self._adjoint(c, np.asarray(ids), count) for c in range(self.channels)]
         result = np.empty((len(ids), direct.shape[1], self.channels), np.float32)
         for texels, light in ColumnBlocks(direct):
             for c, weights in enumerate(totals):
                 result[:, texels, c] = weights.T @ light
         return result
 
-    def _adjoint(self, rho: Floats, ids: NDArray[np.integer], count: int) -> Floats:
+    def _adjoint(self, channel: int, ids: NDArray[np.integer], count: int) -> Floats:
         """Weights (n_v, k) of all vertices' direct light in the indirect light of some."""
+        rho, transposed = self._albedo[channel], of_channel(self._transposed, channel)
         weights = np.zeros((len(rho), len(ids)), np.float32)
         weights[ids, np.arange(len(ids))] = 1
         total = np.zeros_like(weights)
         for _ in range(count):
-            weights = rho[:, None] * multiply_sparse(
-                self._transposed, self.nodes.interpolate_adjoint(weights)
-            )
+            weights = rho[:, None] * multiply_sparse(transposed, self.nodes.interpolate_adjoint(weights))
             total += weights
         return total
 
     @cached_property
-    def _transposed(self) -> scipy.sparse.csr_array:
-        return self.matrix.T.tocsr()
+    def _transposed(self) -> list[scipy.sparse.csr_array]:
+        return [matrix.T.tocsr() for matrix in self._sums]
 
     def indirect(
         self, direct: Operator, tolerance: float = 0.03, specular: Operator | None = None
@@ -250,33 +261,39 @@ class FiniteElements:
         """
         if specular is not None and specular.by_depth:
             return self._by_depth((direct, *specular.by_depth[:-1]), tolerance)
-        if specular is not None:
-            direct = Sum((direct, specular))
-        count = self._count_for(direct)
+        count = self._count_for(direct if specular is None else Sum((direct, specular)))
         if count == 0:
             left = np.zeros((self._albedo.shape[1], 0), np.float32)
             right = np.zeros((0, direct.shape[1]), np.float32)
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
-        keys = self._keys[self.nodes.ids]
-        matrix = StackedFormFactors([self.matrix])
+        lights = [direct] if specular is None else _with_specular(direct, specular)
         first = first_bounce(
-            matrix, self._albedo, [direct], keys, tolerance, self.seed, self.options.basis, self.weights
+            [StackedFormFactors([matrix]) for matrix in self._sums],
+            self._coloured(len(lights)),
+            lights,
+            self._keys[self.nodes.ids],
+            tolerance,
+            self.seed,
+            self.options.basis,
+            self.weights,
         )
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         spread = tuple(self.nodes.interpolate(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
 
+    def _coloured(self, colours: int) -> Floats:
+        """Albedos (channels, n), of each of three colours if light has so many."""
+        return self._albedo[np.minimum(np.arange(max(colours, self.channels)), self.channels - 1)]
+
     def _by_depth(self, lights: Sequence[Operator], tolerance: float) -> GatheredByDepth:
         """Indirect light that met 1, 2, ... surfaces, from light E_0, E_1, ... that met as many specular ones."""
         count, colours = len(lights), max(light.shape[2] for light in lights)
         lit = [t for t, light in enumerate(lights) if t == 0 or not _is_dark(light)]
-        albedo, stacks = self._albedo, [Stacked(tuple(lights[t] for t in lit))]
-        if colours > 1:
-            albedo = albedo[np.minimum(np.arange(colours), self.channels - 1)]
-            stacks = [Stacked(tuple(_channel(lights[t], c) for t in lit)) for c in range(colours)]
+        albedo = self._coloured(colours)
+        stacks = [Stacked(tuple(_channel(lights[t], c) for t in lit)) for c in range(colours)]
         keys = self._keys[self.nodes.ids]
         first = first_bounce(
-            StackedFormFactors(self._matrices, lit, count),
+            [StackedFormFactors(own, lit, count) for own in self._matrices],
             np.tile(albedo, len(lit)),
             stacks,
             np.concatenate([mix(keys + np.uint64(s)) if s else keys for s in range(count)]),
@@ -310,18 +327,13 @@ class FiniteElements:
     ) -> None:
         """Add what light of a depth, the first being 0, becomes by one bounce and some specular surfaces after it."""
         energies = [self._energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
-        for x, rho, kept in zip(light, albedo, all_but_least(energies, least), strict=True):
+        for c, (x, rho, kept) in enumerate(zip(light, albedo, all_but_least(energies, least), strict=True)):
+            matrix, after = of_channel(self._matrices, c)[met], x[depth + 1 + met]
             if kept.all():
-                add_scaled(
-                    self._matrices[met],
-                    rho[None],
-                    self.nodes.interpolate(x[depth]),
-                    x[depth + 1 + met][None],
-                    0,
-                )
+                add_scaled(matrix, rho[None], self.nodes.interpolate(x[depth]), after[None], 0)
             elif kept.any():
                 some = self.nodes.interpolate(np.ascontiguousarray(x[depth][:, kept]))
-                x[depth + 1 + met][:, kept] += multiply_scaled(self._matrices[met], rho[None], some)[0]
+                after[:, kept] += multiply_scaled(matrix, rho[None], some)[0]
 
     def _terms(
         self, light: list[list[Floats]], sizes: list[Doubles], right: Sequence[Floats], least: float
@@ -374,7 +386,7 @@ class FiniteElements:
             If ``max_depth`` is -1 and light does not end, between white surfaces that let none escape.
         """
         total, count = 0.0, 0
-        light = list(multiply_scaled(self.matrix, self._albedo, even[:, None]))
+        light = self._gathered(even[:, None])
         while self.max_depth < 0 or count < self.max_depth - 2:
             peak = max(float(x.max(initial=0)) for x in light)
             if peak == 0:
@@ -404,8 +416,18 @@ class FiniteElements:
 
     def _reflected(self, light: list[Floats]) -> list[Floats]:
         """One bounce: G rho W x for arrays x (n_nodes, any), one per channel."""
-        pairs = zip(self._albedo, light, strict=True)
-        return [multiply_scaled(self.matrix, rho[None], self.nodes.interpolate(x))[0] for rho, x in pairs]
+        return [self._reflect_one(c, self.nodes.interpolate(x)) for c, x in enumerate(light)]
+
+    def _reflect_one(self, channel: int, light: Floats) -> Floats:
+        """G rho x of one channel, for light x (n, any)."""
+        rho = of_channel(self._albedo, channel)[None]
+        return multiply_scaled(of_channel(self._sums, channel), rho, light)[0]
+
+    def _gathered(self, light: Floats) -> list[Floats]:
+        """G rho x of each channel, for the same light x (n, any)."""
+        if len(self._sums) == 1:
+            return list(multiply_scaled(self.matrix, self._albedo, light))
+        return [self._reflect_one(c, light) for c in range(self.channels)]
 
 
 class RadiositySolver(FiniteElements):
@@ -450,7 +472,7 @@ class RadiositySolver(FiniteElements):
         scene, points = problem.scene, problem.points
         nodes = nodes or Nodes(np.arange(len(points)), None)
         super().__init__(
-            form_factors(problem, rays_per_vertex, seed, nodes.ids),
+            [form_factors(problem, rays_per_vertex, seed, nodes.ids)],
             np.ascontiguousarray(scene.albedo.T[: problem.channels]),
             points.keys,
             nodes,
@@ -479,11 +501,11 @@ class RadiositySolver(FiniteElements):
         found = form_factors(problem, self._rays_per_vertex, self.seed, every)
         matrix = scipy.sparse.csr_array(sum(found[1:], found[0]))
         self.rays += len(points) * self._rays_per_vertex
-        lit = direct if specular is None else Sum((direct, specular))
+        lights = [direct] if specular is None else _with_specular(direct, specular)
         first = first_bounce(
-            StackedFormFactors([matrix]),
-            self._albedo,
-            [lit],
+            [StackedFormFactors([matrix])],
+            self._coloured(len(lights)),
+            lights,
             points.keys,
             tolerance,
             self.seed,
@@ -493,7 +515,8 @@ class RadiositySolver(FiniteElements):
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
         assert isinstance(before, Gathered)
         again = [
-            multiply_scaled(matrix, rho[None], x)[0] for rho, x in zip(self._albedo, before.left, strict=True)
+            multiply_scaled(matrix, of_channel(self._albedo, c)[None], x)[0]
+            for c, x in enumerate(before.left)
         ]
         return Gathered(
             tuple(np.hstack(pair) for pair in zip(first.left, again, strict=True)),
@@ -501,6 +524,11 @@ class RadiositySolver(FiniteElements):
             first.left_out,
             before.bounces + 1,
         )
+
+
+def _with_specular(direct: Operator, specular: Operator) -> list[Operator]:
+    """Direct and specular light together, of each channel, or of all."""
+    return [Sum((direct, _channel(specular, c))) for c in range(specular.shape[2])]
 
 
 def _channel(light: Operator, number: int) -> Operator:

@@ -437,7 +437,7 @@ def test_coloured_light_is_told_apart_by_depth():
     direct = SparseRows((sparse(m, 0.5),))
     specular = ByDepth(tuple(SparseRows(tuple(sparse(m, 0.1) for _ in range(3))) for _ in range(count)))
     keys = rng.integers(1 << 63, size=n).astype(np.uint64)
-    elements = FiniteElements(matrices, albedo, keys, Nodes(np.arange(n), None), 2 + count, 1)
+    elements = FiniteElements([matrices], albedo, keys, Nodes(np.arange(n), None), 2 + count, 1)
     found = elements.indirect(direct, 1e-3, specular)
     assert len(found.terms) == count
     for c in range(3):
