@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 
 from mi_sparse_prt.core.errors import PrtError
 
+FEW = 1024  # points whose neighbours one thread looks for
+
 
 @dataclass(frozen=True)
 class Neighbours:
@@ -76,6 +78,7 @@ def surface_neighbours(
     candidate_normals: NDArray[np.floating],
     count: int,
     least_cosine: float = 0.2,
+    looked_through: int = 4,
 ) -> Neighbours:
     """The nearest candidates along a surface: near in position, and facing the same way.
 
@@ -90,9 +93,11 @@ def surface_neighbours(
     candidate_positions, candidate_normals : (m, 3) float
         Of the same mesh.
     count : int
-        The k of the result. A point may get fewer: the nearest ``4 count`` candidates are looked through.
+        The k of the result. A point may get fewer.
     least_cosine : float
         Between normals; below it, points see different halves of the scene.
+    looked_through : int
+        Times ``count`` candidates, the nearest, are looked through at most.
 
     Returns
     -------
@@ -120,7 +125,7 @@ def surface_neighbours(
         complete = _take_agreeing(
             found.ids, found.distances, short, n, candidate_n, least_cosine, ids, distances
         )
-        if reach >= min(len(others), 4 * count):
+        if reach >= min(len(others), looked_through * count):
             break
         reach, short = 2 * reach, short[~complete]
     return Neighbours(ids, distances)
@@ -184,12 +189,17 @@ def _nearest(
     asked = min(k, len(candidates))
     # the tree's bound is exclusive, and it squares it: 0 must not become 0 again
     bound = math.nextafter(radius, math.inf) + 1e-150
-    near, rows = tree.query(points, k=np.arange(1, asked + 1), distance_upper_bound=bound, workers=-1)
+    near, rows = tree.query(points, k=np.arange(1, asked + 1), distance_upper_bound=bound, workers=_workers(len(points)))
     distances[:, :asked] = near
     ids[:, :asked] = np.append(order, -1).astype(np.int32)[
         rows
     ]  # the tree's word for nothing is one row past its last
     return Neighbours(ids, distances)
+
+
+def _workers(asked: int) -> int:
+    """Threads for a search: to start all takes longer than it takes one to find neighbours of few points."""
+    return -1 if asked > FEW else 1
 
 
 def _empty(n: int, k: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -209,7 +219,7 @@ def _spacing(candidates: NDArray[np.float64]) -> float:
     if len(places) < 2:
         return 0.0
     some = places[:: -(-len(places) // 4096)]  # enough for a median
-    return float(np.median(cKDTree(places).query(some, k=[2], workers=-1)[0]))
+    return float(np.median(cKDTree(places).query(some, k=[2], workers=_workers(len(some)))[0]))
 
 
 def _check_count(name: str, value: int) -> None:

@@ -23,6 +23,7 @@ from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
+from mi_sparse_prt.reconstruction.gather_noise import GatherNoise
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -144,7 +145,8 @@ class Execution:
         assert known.direct is not None  # it is the first light that bounces
         with clock.phase("gather_rays"):
             nodes = choose_nodes(problem.scene, sources.points)
-            gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes)
+            noise = GatherNoise(sources, nodes, plan.rays, self._run.seed)
+            gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes, averaging=noise)
         with clock.phase("interreflection"):
             specular = None if known.specular is None else known.specular.operator
             if sources is problem:
@@ -171,7 +173,10 @@ class Execution:
             problem, seed = self._problem, self._run.seed
             nodes = choose_nodes(problem.scene, problem.points)
             specular = None if light.specular is None else light.specular.operator
-            part, noise = glossy_indirect(problem, direct, plan.rays, plan.tolerance, nodes, seed, specular)
+            averaging = GatherNoise(problem, nodes, plan.rays, seed)
+            part, noise = glossy_indirect(
+                problem, direct, plan.rays, plan.tolerance, nodes, seed, specular, averaging
+            )
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays}
         # the rank that leaves this out grows with the rays, too

@@ -12,7 +12,7 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.operator import Floats, Operator
-from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_step
+from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
 from mi_sparse_prt.solvers.problem import Problem, told_apart
@@ -80,7 +80,7 @@ def path_traced_lamps(
         light, variance = (x.reshape(n, m, -1) for x in (found.mean, found.variance))
         if problem.at_vertices is problem:
             with run.clock.phase("smoothing"):
-                light = smooth_light(light, variance, smoothing_step(problem.scene, problem.points))
+                light = smooth_light(light, variance, smoothing_levels(problem.scene, problem.points))
         indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
     return _result(direct, indirect, rays)
 

@@ -1,58 +1,152 @@
 """Noise averaged out along surfaces, at each vertex over as wide a neighbourhood as is worth it.
 
-Steps of smoothing are taken one after another, 1, 2, 4, ... of them. What n vertices with noise of variance s^2 are off
-by after that is not known, but Stein's unbiased estimate of it is: |S x - x|^2 - s^2 + 2 S_ii s^2, if S is what the
-steps do (Stein 1981; Li, Wu and Chuang 2012, "SURE-based Optimization for Adaptive Sampling and Reconstruction"). The
-neighbourhood is that for which it is least.
+Levels of smoothing follow each other, each over neighbours that are twice as far apart, as there is less to see in what
+is smooth already ("a trous", Dammertz et al. 2010, "Edge-Avoiding A-Trous Wavelet Transform for fast Global
+Illumination Filtering"): three of them average as widely as 16 steps among nearest neighbours.
+
+What n vertices with noise of variance s^2 are off by after that is not known, but Stein's unbiased estimate of it is:
+|S x - x|^2 - s^2 + 2 S_ii s^2, if S is what the levels do (Stein 1981; Li, Wu and Chuang 2012, "SURE-based Optimization
+for Adaptive Sampling and Reconstruction"). The neighbourhood is that for which it is least.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.morton import morton_order
+from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.measurement.neighbours import surface_neighbours
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.walls import Walls
 
-NEAR = 12  # vertices of a neighbourhood; 8 leave up to twice the noise after as many steps
-STEPS = (1, 2, 4, 8, 16)  # 32 were hardly ever better than 16
+NEAR = 12  # vertices of a neighbourhood; 8 leave up to twice the noise
+STRIDES = (1, 4, 16)  # of vertices along a curve, of which one is looked at on each level; 64 was not better
 OWN = 0.25  # of its own variance a vertex has at least: the mean of neighbours would not know that it is an outlier
 
 Floats = NDArray[np.float32]
 
 
-def smoothing_step(scene: Scene, points: Points) -> scipy.sparse.csr_array:
-    """One step: each vertex of a mesh takes the value at it of the linear function that fits its neighbours best.
+def smoothing_levels(
+    scene: Scene, points: Points, vertices: NDArray[np.int64] | None = None
+) -> list[scipy.sparse.csr_array]:
+    """Each vertex of a mesh takes the value at it of the linear function that fits its neighbours best.
 
     Parameters
     ----------
     scene : Scene
     points : Points
         Of all vertices.
+    vertices : (n,) integers, optional
+        Those that are smoothed, among themselves, ascending; all if not given.
 
     Returns
     -------
-    (n_v, n_v) sparse float32
-        Rows sum to 1. Neighbours face the same way, and no wall is between them.
+    list of (n, n) sparse float32
+        One after another. Rows sum to 1. Neighbours face the same way, and no wall is between them.
     """
-    p, n, walls = scene.normalised_positions, scene.normals, Walls(scene, points)
-    blocks = []
-    for mesh in scene.meshes:
-        inside, ids = mesh.vertices, np.arange(mesh.vertices.start, mesh.vertices.stop)
-        near = surface_neighbours(p[inside], n[inside], p[inside], n[inside], NEAR)
-        near = walls.without_hidden(ids, near, ids)
-        weights = linear_weights(near, p[inside], n[inside], p[inside], n[inside])
-        row, place = np.nonzero(near.ids >= 0)
-        entries = weights[row, place], (row, near.ids[row, place])
-        blocks.append(scipy.sparse.coo_array(entries, shape=(len(ids), len(ids))))
-    return scipy.sparse.block_diag(blocks, format="csr", dtype=np.float32)
+    chosen, walls = np.arange(len(points)) if vertices is None else vertices, Walls(scene, points)
+    bounds = [np.searchsorted(chosen, (mesh.vertices.start, mesh.vertices.stop)) for mesh in scene.meshes]
+    meshes = [chosen[a:b] for a, b in bounds]
+    return [
+        scipy.sparse.block_diag(
+            [_smoothed(scene, points, walls, ids, stride) for ids in meshes], "csr", np.float32
+        )
+        for stride in STRIDES
+    ]
 
 
-def smooth_light(light: Floats, variance: Floats, step: scipy.sparse.csr_array) -> Floats:
+def _smoothed(
+    scene: Scene, points: Points, walls: Walls, ids: NDArray[np.int64], stride: int
+) -> scipy.sparse.coo_array:
+    """One level on a mesh: about every so many of its vertices are looked at."""
+    p, n, size = scene.normalised_positions[ids], scene.normals[ids], len(ids)
+    count = max(size // stride, min(size, NEAR))
+    seen = np.sort(morton_order(p, points.keys[ids])[(2 * np.arange(count) + 1) * size // (2 * count)])
+    near = surface_neighbours(p, n, p[seen], n[seen], NEAR, looked_through=1)
+    near = walls.without_hidden(ids, near, ids[seen])
+    weights = linear_weights(near, p, n, p[seen], n[seen])
+    row, place = np.nonzero(near.ids >= 0)
+    alone = np.flatnonzero(near.ids[:, 0] < 0)  # sees none of these, and keeps its own value
+    entries = np.concatenate([weights[row, place], np.ones(len(alone), np.float32)])
+    columns = np.concatenate([seen[near.ids[row, place]], alone])
+    return scipy.sparse.coo_array((entries, (np.concatenate([row, alone]), columns)), shape=(size, size))
+
+
+class SurfaceSmoothing:
+    """No, one or more levels of smoothing, at each vertex as many as leave the least error.
+
+    Parameters
+    ----------
+    levels : list of (n_v, n_v) sparse float32
+        As of ``smoothing_levels``.
+    """
+
+    def __init__(self, levels: list[scipy.sparse.csr_array]) -> None:
+        self._levels, near = levels, levels[0]
+        self._pool = scipy.sparse.csr_array((np.ones_like(near.data), near.indices, near.indptr), near.shape)
+        self._pool.data /= np.repeat(self._pool.sum(axis=1), np.diff(near.indptr))
+
+    def pooled(self, values: Floats) -> Floats:
+        """Means (n_v, k) over the neighbours of each vertex."""
+        return multiply_sparse(self._pool, values)
+
+    @cached_property
+    def own(self) -> Floats:
+        """What vertices have of their own value after no, one, ... levels (levels + 1, n_v)."""
+        first, second, *others = self._levels
+        twice = second.multiply(first.T).sum(axis=1)
+        # each further level reaches four times as many vertices
+        further = [twice / 4**k for k in range(1, len(others) + 1)]
+        return np.stack([np.ones_like(twice), first.diagonal(), twice, *further])
+
+    def least(self, light: Floats, risk: Callable[[Floats, int], Floats]) -> NDArray[np.int8]:
+        """How many levels leave the least error.
+
+        Parameters
+        ----------
+        light : (n_v, k) float32
+        risk : callable
+            Of ``light`` after some levels, and their number: estimates (n_v, m) of the squared error.
+
+        Returns
+        -------
+        (n_v, m) int8
+        """
+        least = self.pooled(risk(light, 0))
+        chosen = np.zeros(least.shape, np.int8)
+        for number, smooth in self._after(light):
+            found = self.pooled(risk(smooth, number))
+            better = found < least
+            chosen[better], least[better] = number, found[better]
+        return chosen
+
+    def averaged(self, light: Floats, chosen: NDArray[np.int8]) -> Floats:
+        """Light (n_v, m, ...) after as many levels as were chosen (n_v, m); no seams where neighbours differ."""
+        own = (*chosen.shape, *(1,) * (light.ndim - chosen.ndim))
+
+        def share(number: int) -> Floats:
+            return self.pooled((chosen == number).astype(np.float32)).reshape(own)
+
+        result = share(0) * light
+        for number, smooth in self._after(light.reshape(len(light), -1)):
+            result += share(number) * smooth.reshape(light.shape)
+        return result
+
+    def _after(self, light: Floats) -> Iterator[tuple[int, Floats]]:
+        """Light (n_v, k) after 1, 2, ... levels."""
+        for number, level in enumerate(self._levels, 1):
+            light = multiply_sparse(level, light)
+            yield number, light
+
+
+def smooth_light(light: Floats, variance: Floats, levels: list[scipy.sparse.csr_array]) -> Floats:
     """Estimates of light at vertices, with less noise.
 
     Parameters
@@ -61,8 +155,8 @@ def smooth_light(light: Floats, variance: Floats, step: scipy.sparse.csr_array) 
         Independent, unbiased estimates of m lights, of which none is negative.
     variance : (n_v, m, channels) float32
         Of each estimate.
-    step : (n_v, n_v) sparse float32
-        As of ``smoothing_step``.
+    levels : list of (n_v, n_v) sparse float32
+        As of ``smoothing_levels``.
 
     Returns
     -------
@@ -70,38 +164,12 @@ def smooth_light(light: Floats, variance: Floats, step: scipy.sparse.csr_array) 
     """
     if not variance.any():  # nothing to average out, or one path per element: the noise is unknown
         return light
-    pool = scipy.sparse.csr_array((np.ones_like(step.data), step.indices, step.indptr), shape=step.shape)
-    pool.data /= np.repeat(pool.sum(axis=1), np.diff(pool.indptr))
-    chosen = _least_risk(light, variance, step, pool)
-    result, smooth = np.zeros_like(light), light.reshape(len(light), -1)
-    done = 0
-    for number, steps in enumerate((0, *STEPS)):
-        for _ in range(done, steps):
-            smooth = step @ smooth
-        done = steps
-        share = pool @ (chosen == number).astype(np.float32)  # no seams where neighbours differ
-        result += share[..., None] * smooth.reshape(light.shape)
-    return np.maximum(result, 0)
+    smoothing, flat = SurfaceSmoothing(levels), light.reshape(len(light), -1)
+    spread = variance.reshape(flat.shape)
+    noise = np.maximum(smoothing.pooled(spread), np.float32(OWN) * spread)
 
+    def risk(smooth: Floats, number: int) -> Floats:
+        found = (smooth - flat) ** 2 + (2 * smoothing.own[number][:, None] - 1) * noise
+        return np.ascontiguousarray(found.reshape(light.shape).sum(axis=2))
 
-def _least_risk(
-    light: Floats, variance: Floats, step: scipy.sparse.csr_array, pool: scipy.sparse.csr_array
-) -> NDArray[np.int8]:
-    """Which of 0, 1, 2, ... steps leave the least error (n_v, m), about, of all channels together."""
-    shape = light.shape
-    flat = light.reshape(shape[0], -1)
-    noise = np.maximum(pool @ variance.reshape(flat.shape), np.float32(OWN) * variance.reshape(flat.shape))
-    smooth, done = flat, 0
-    chosen, least = np.zeros(shape[:2], np.int8), noise.reshape(shape).sum(axis=2)
-    once, twice = step.diagonal(), step.multiply(step.T).sum(axis=1)  # the diagonals of S and S^2
-    for number, steps in enumerate(STEPS, 1):
-        for _ in range(done, steps):
-            smooth = step @ smooth
-        done = steps
-        # of S^4, S^8, ...: twice as many steps reach twice as many vertices
-        own = once if steps == 1 else twice * (2 / steps)
-        risk = (smooth - flat) ** 2 + (2 * own[:, None].astype(np.float32) - 1) * noise
-        risk = pool @ risk.reshape(shape).sum(axis=2)
-        better = risk < least
-        chosen[better], least[better] = number, risk[better]
-    return chosen
+    return np.maximum(smoothing.averaged(light, smoothing.least(flat, risk)), 0)

@@ -10,7 +10,7 @@ squared error is then 1 + r / (s - r) times the least, s rows and rank r (Drinea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -141,9 +141,10 @@ def first_bounce(
         fit *= weights[rows]
     right = [fit @ known for known in _rows([m.rows(rows) for m in matrices], albedo, lights)]
     found = _truncated(columns, turn, right, missed, tolerance)
-    if weights is None:
-        return found
-    return replace(found, left=tuple(x / weights[:, None] for x in found.left))
+    if weights is not None:
+        for x in found.left:
+            x /= weights[:, None]
+    return found
 
 
 def _basis(

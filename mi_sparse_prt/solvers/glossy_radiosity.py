@@ -25,6 +25,7 @@ from mi_sparse_prt.solvers.glossy_rays import Noise, gather_matrix, gather_rays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import (
     NEGLIGIBLE,
+    Averaging,
     FiniteElements,
     Gathered,
     GatheredByDepth,
@@ -113,6 +114,7 @@ def glossy_indirect(
     nodes: Nodes,
     seed: int,
     specular: SparseRows | ByDepth | None = None,
+    averaging: Averaging | None = None,
 ) -> tuple[Gathered | GatheredByDepth, Noise]:
     """Indirect light of all rows of ``direct``, factored per channel, and the noise of the rays.
 
@@ -131,6 +133,8 @@ def glossy_indirect(
     specular : SparseRows or ByDepth, optional
         Light from the sky by way of mirrors and glass, which surfaces send on as well. What they send on by way of
         mirrors and glass reaches unit-albedo rows, and of glossy surfaces as far as these are diffuse.
+    averaging : Averaging, optional
+        Of the noise of unit-albedo rows.
     """
     assert isinstance(problem.reflection, InOutFactors)
     albedo, outgoing = _channels(problem.reflection)
@@ -146,6 +150,7 @@ def glossy_indirect(
     of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
     every, weights = np.hstack([albedo, of_terms]), problem.reflection.row_weights.mean(axis=1)
     solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)
+    solver.averaging = averaging
     return solver.indirect(direct, tolerance, specular), noise
 
 

@@ -20,16 +20,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.by_depth import ByDepth
-from mi_sparse_prt.operators.column_blocks import ColumnBlocks
+from mi_sparse_prt.operators.column_blocks import ColumnBlocks, combine_randomly
 from mi_sparse_prt.operators.low_rank import LowRank
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
@@ -49,6 +51,7 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 COLUMNS = 256  # of a dense matrix that G is applied to at a time
 NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
+JUDGED = 2  # times 32 sums of columns tell the noise of rays
 LONGEST = 1024  # bounces after which light is taken not to end
 
 Floats = NDArray[np.float32]
@@ -111,6 +114,14 @@ class GatheredByDepth(ByDepth):
         return len(self.terms)
 
 
+class Averaging(Protocol):
+    """Averages out noise of rays between neighbouring nodes (``reconstruction.gather_noise``)."""
+
+    def judge(self, matrix: scipy.sparse.csr_array, light: Floats) -> None: ...
+
+    def averaged(self, light: Floats) -> Floats: ...
+
+
 class FiniteElements:
     """Interreflections between vertices, or whatever else rows of light stand for.
 
@@ -136,9 +147,12 @@ class FiniteElements:
     options : LowRankOptions
     weights : (n_nodes,) float32 or None
         What errors of rows count by in a low rank, above 0; None where all are alike.
+    averaging : Averaging or None
+        Of the noise of rays in indirect light for all texels, of which the first rows are vertices.
     """
 
     weights: Floats | None = None
+    averaging: Averaging | None = None
 
     def __init__(
         self,
@@ -278,8 +292,27 @@ class FiniteElements:
             self.weights,
         )
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
-        spread = tuple(self.nodes.interpolate(total) for total in totals)
+        self._judge_noise([of_channel(lights, 1)], count)
+        spread = tuple(self._spread(total) for total in totals)
         return Gathered(spread, first.right, first.left_out, count)
+
+    def _judge_noise(self, lights: Sequence[Operator], count: int) -> None:
+        """By random sums of columns, of one channel: of light that arrives, and of what surfaces send on of it."""
+        if self.averaging is None:
+            return
+        light, rng = Sum(tuple(lights)), np.random.default_rng(self.seed)
+        sums = [np.empty((light.shape[0], min(BITS, light.shape[1])), np.float32) for _ in range(JUDGED)]
+        for some in sums:
+            combine_randomly(light, self.options.basis.mixed, rng, some)
+        total = sent = np.hstack(sums)
+        for _ in range(count - 1):
+            sent = self.nodes.interpolate(self._reflect_one(1, sent))
+            total = total + sent
+        self.averaging.judge(of_channel(self._matrices, 1)[0], total)
+
+    def _spread(self, light: Floats) -> Floats:
+        """Light (n_nodes, k) of the nodes, with less noise, at all vertices."""
+        return self.nodes.interpolate(light if self.averaging is None else self.averaging.averaged(light))
 
     def _coloured(self, colours: int) -> Floats:
         """Albedos (channels, n), of each of three colours if light has so many."""
@@ -309,6 +342,7 @@ class FiniteElements:
         for s in range(1, count):
             for k in range(s):
                 self._reflect(light, s - 1 - k, k, albedo, sizes, least / count)
+        self._judge_noise([_channel(light, 1) for light in lights], count)
         return GatheredByDepth(self._terms(light, sizes, first.right, least), first.left_out)
 
     def _energies(self, x: Floats) -> NDArray[np.float64]:
@@ -344,7 +378,7 @@ class FiniteElements:
         channels = []
         for own, b in zip(light, right, strict=True):
             some = [(x, next(kept)) for x in own]
-            channels.append([(self.nodes.interpolate(np.ascontiguousarray(x[:, k])), b[k]) for x, k in some])
+            channels.append([(self._spread(np.ascontiguousarray(x[:, k])), b[k]) for x, k in some])
         depths = zip(*channels, strict=True)
         return tuple(LowRank(tuple(a for a, _ in some), tuple(b for _, b in some)) for some in depths)
 
@@ -444,6 +478,8 @@ class RadiositySolver(FiniteElements):
     nodes : Nodes, optional
         The vertices that gather light, others interpolate theirs; all if not given.
     options : LowRankOptions, optional
+    averaging : Averaging, optional
+        As for ``FiniteElements``.
 
     Attributes
     ----------
@@ -468,6 +504,7 @@ class RadiositySolver(FiniteElements):
         seed: int = 0,
         nodes: Nodes | None = None,
         options: LowRankOptions | None = None,
+        averaging: Averaging | None = None,
     ) -> None:
         scene, points = problem.scene, problem.points
         nodes = nodes or Nodes(np.arange(len(points)), None)
@@ -479,7 +516,7 @@ class RadiositySolver(FiniteElements):
             problem.max_depth,
             seed,
         )
-        self.options = options or self.options
+        self.options, self.averaging = options or self.options, averaging
         self.rays = len(nodes) * rays_per_vertex
         self._scene, self._rays_per_vertex = scene, rays_per_vertex
 

@@ -5,7 +5,7 @@ import pytest
 from conftest import T, build, diffuse
 
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_step
+from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_levels
 
 
 def _room(**others):
@@ -29,12 +29,14 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def step(scene):
-    return smoothing_step(scene, vertex_points(scene))
+def levels(scene):
+    return smoothing_levels(scene, vertex_points(scene))
 
 
-def test_a_step_keeps_what_is_linear_and_stays_on_its_side(scene, step):
+@pytest.mark.parametrize("number", range(3))
+def test_a_level_keeps_what_is_linear_and_stays_on_its_side(scene, levels, number):
     """Expected: weights sum to 1; no vertex of the floor takes light from the other side of the wall."""
+    step, reach = levels[number], (0.5, 0.5, 1.2)[number]
     np.testing.assert_allclose(step.sum(axis=1), 1, atol=1e-5)
     floor = next(mesh for mesh in scene.meshes if mesh.name == "floor").vertices
     x = scene.positions[floor, 0]
@@ -42,13 +44,14 @@ def test_a_step_keeps_what_is_linear_and_stays_on_its_side(scene, step):
     apart = (np.abs(x[row]) > 0.02) & (np.abs(x[column]) > 0.02)  # and not below the wall
     assert apart.any()
     assert (x[row] * x[column] > 0)[apart].all()
-    inner = np.abs(scene.positions[floor][:, [0, 2]]).max(axis=1) < 1.5
-    inner &= np.abs(x) > 0.5
+    inner = np.abs(scene.positions[floor][:, [0, 2]]).max(axis=1) < 2 - reach
+    inner &= np.abs(np.abs(x) - 1) < 1 - reach if number < 2 else np.abs(np.abs(x) - 1) < 0.3
+    assert inner.sum() > 50
     smooth = step[floor, floor] @ scene.positions[floor]
     np.testing.assert_allclose(smooth[inner], scene.positions[floor][inner], atol=0.02)
 
 
-def test_noise_goes_and_light_stays(scene, step):
+def test_noise_goes_and_light_stays(scene, levels):
     """Rationale: of light that is smooth, noise is averaged over many vertices; at edges of shadows, over few.
 
     Expected: of 10% noise less than 3.5% is left of smooth light, and its mean is the same within 1%. A shadow whose
@@ -62,7 +65,7 @@ def test_noise_goes_and_light_stays(scene, step):
     truth = np.concatenate([even, shadow, closed], axis=1)
     deviation = 0.1 * truth
     noisy = (truth + deviation * rng.normal(size=truth.shape)).astype(np.float32)
-    found = smooth_light(noisy, (deviation**2).astype(np.float32), step)
+    found = smooth_light(noisy, (deviation**2).astype(np.float32), levels)
     error = np.sqrt(((found - truth) ** 2).mean(axis=(0, 2)) / (truth**2).mean(axis=(0, 2)))
     print(error, found.mean(axis=(0, 2)) / truth.mean(axis=(0, 2)))
     assert error[0] < 0.035
@@ -73,10 +76,10 @@ def test_noise_goes_and_light_stays(scene, step):
     assert not found[dark, 2].any()
 
 
-def test_without_noise_nothing_changes(scene, step):
+def test_without_noise_nothing_changes(scene, levels):
     """Expected: as given, where variances are 0; with little noise, what is no noise is kept."""
     rng = np.random.default_rng(4)
     light = rng.random((scene.n_vertices, 1, 3)).astype(np.float32)
-    np.testing.assert_array_equal(smooth_light(light, np.zeros_like(light), step), light)
-    kept = smooth_light(light, np.full_like(light, 1e-8), step)
+    np.testing.assert_array_equal(smooth_light(light, np.zeros_like(light), levels), light)
+    kept = smooth_light(light, np.full_like(light, 1e-8), levels)
     np.testing.assert_allclose(kept, light, atol=1e-5)
