@@ -191,9 +191,7 @@ class _Attempts:
         if self._dark is None and self._problem.specular_apart:
             with run.clock.phase("specular"):
                 self._specular = SpecularSteps(self._problem, settings, run.seed)
-            if costs is not None and self._specular.seen is not None:
-                known = {how: cost.with_known_centres for how, cost in costs.direct.items()}
-                costs = replace(costs, direct=known)
+            costs = None if costs is None else _beside_specular(costs, self._specular)
         noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.light)
         self._proposals = _proposals(settings, costs, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, light)
@@ -404,6 +402,14 @@ def _measured(
         return settings, None
     with clock.phase("plan"):
         return settings, measure(direct, settings, indirect)
+
+
+def _beside_specular(costs: Costs, light: SpecularSteps) -> Costs:
+    """Costs, where light by way of mirrors and glass is known."""
+    direct = costs.direct
+    if light.seen is not None:
+        direct = {how: cost.with_known_centres for how, cost in direct.items()}
+    return replace(costs, direct=direct, bent=light.most)
 
 
 def _proposals(

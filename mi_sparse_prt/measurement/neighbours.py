@@ -189,7 +189,9 @@ def _nearest(
     asked = min(k, len(candidates))
     # the tree's bound is exclusive, and it squares it: 0 must not become 0 again
     bound = math.nextafter(radius, math.inf) + 1e-150
-    near, rows = tree.query(points, k=np.arange(1, asked + 1), distance_upper_bound=bound, workers=_workers(len(points)))
+    near, rows = tree.query(
+        points, k=np.arange(1, asked + 1), distance_upper_bound=bound, workers=_workers(len(points))
+    )
     distances[:, :asked] = near
     ids[:, :asked] = np.append(order, -1).astype(np.int32)[
         rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ SAFE = 1.1  # by what factor a plan for after a miss is below the target: that m
 WORST_FACTOR = 2.0  # by what factor predictions may be off where they are worst
 STANDARD_ERROR = 0.07  # relative standard error of what a round of held-out elements finds; a typical one
 MINIMUM_GAIN = 0.9  # of an error is better
+ALIKE = 1.03  # times as long is as quick: predictions of time tell no more, and then the most exact is taken
 FIRST_SHARE = (
     0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first
 )
@@ -50,6 +51,8 @@ class Costs:
         Norm of direct light relative to that of the whole matrix.
     specular : float
         Relative error that light by way of mirrors and glass adds to every plan.
+    bent : bool
+        Whether most light comes by way of mirrors and glass, which a pilot leaves out: ranks are not known then.
     dark : bool
         Whether next to no light arrives: errors relative to it do not count.
     """
@@ -62,6 +65,7 @@ class Costs:
     direct_share: float = 1.0
     check: float = 0.0
     specular: float = 0.0
+    bent: bool = False
     dark: bool = False
 
 
@@ -149,12 +153,20 @@ def choose(plans: list[Predicted], target: float | None) -> Predicted:
     more samples would: nobody asked for hours.
     """
     if target is None:
-        return min(plans, key=lambda p: _if_it_met(TARGET, p))
+        return _quickest(plans, lambda p: _if_it_met(TARGET, p))
     good = [p for p in plans if p.error <= target]
     if good:
-        return min(good, key=lambda p: p.seconds + p.risk)
+        return _quickest(good, lambda p: p.seconds + p.risk)
     least = min(p.error for p in plans)
     return min((p for p in plans if MINIMUM_GAIN * p.error <= least), key=lambda p: p.seconds)
+
+
+def _quickest(plans: list[Predicted], cost: Callable[[Predicted], float]) -> Predicted:
+    """The quickest, or the most exact that finds light in the same ways and takes about as long."""
+    best = min(plans, key=cost)
+    ways = best.plan.direct, best.plan.indirect
+    same = (p for p in plans if (p.plan.direct, p.plan.indirect) == ways and cost(p) <= ALIKE * cost(best))
+    return min(same, key=lambda p: (p.error, cost(p)))
 
 
 def choose_first(plans: list[Predicted], target: float | None) -> Predicted:
@@ -258,7 +270,7 @@ def _indirect(costs: Costs, direct: str, room: float, spp: int | None) -> Iterat
         return
     if costs.gather is not None:
         for rays, finest in GATHER:
-            for tolerance in costs.gather.tolerances(rays, finest):
+            for tolerance in (finest,) if costs.bent else costs.gather.tolerances(rays, finest):
                 cost = costs.gather.seconds(rays, tolerance), costs.gather.error(rays, tolerance)
                 yield Plan(direct, "gather", rays, tolerance), *cost
     for resolution, seconds in costs.paths.seconds.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.reconstruction.gather_noise import OTHERS
 from mi_sparse_prt.reconstruction.node_placement import node_count
+from mi_sparse_prt.reconstruction.surface_smoothing import nearest_weights
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
@@ -36,6 +38,8 @@ COMBINED = 30e-9  # seconds for each number of the combinations that make a basi
 BLOCKS = 192  # ... and as many of these are begun at least
 DISTINCT = 1.2  # tolerances that are closer than this factor are as good as one
 LEFT = 2.0  # times the noise of rays may be left out
+AVERAGED = 128  # vertices whose neighbours tell what averaging between these leaves of the noise
+SMOOTHED = 15e-6  # seconds of a node to find its neighbours for that, most of it for k-d trees
 LATER = 2  # bounces after the first one
 GROUPS = 5  # of vertices, for a bias that a few of them do not decide
 
@@ -59,6 +63,9 @@ class GatherCosts:
         Of G, per ray.
     noise_of : dict
         Rays -> relative L2 error of the whole matrix.
+    averaged, alike : float
+        Of the square of the noise of 64 rays, what averaging between neighbours leaves, and what it would leave if
+        these received the same light.
     bias : float
         That of interpolation between vertices, which no number of rays removes; a typical one.
     first : float
@@ -67,6 +74,8 @@ class GatherCosts:
         How much larger the norm of all bounces is.
     spectra : (2, k) float
         Energy that is left of the first bounce beyond each rank, relative, in half the sample and in all of it.
+    depths : int
+        By how many numbers of surfaces light is told apart: each has rows and bounces of its own.
     """
 
     vertices: int
@@ -78,10 +87,13 @@ class GatherCosts:
     addition: float
     entries: float
     noise_of: dict[int, float]
+    averaged: float
+    alike: float
     bias: float
     first: float
     growth: float
     spectra: NDArray[np.float64]
+    depths: int = 1
 
     def error(self, rays: int, tolerance: float) -> float:
         """Predicted relative L2 error of the whole matrix.
@@ -100,10 +112,15 @@ class GatherCosts:
         return replace(self, bias=bias / self.growth)
 
     def noise(self, rays: int) -> float:
-        """Relative L2 error of the whole matrix that comes from the number of rays."""
+        """Relative L2 error of the whole matrix that comes from the number of rays, averaged between neighbours.
+
+        What averaging blurs is the same for any number of rays.
+        """
         few, many = (max(self.noise_of[count], 1e-12) for count in (FEW, MANY))
         fall = math.log(few / many) / math.log(MANY / FEW)
-        return self.noise_of[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
+        own = self.noise_of[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
+        blurred = max(self.averaged - self.alike, 0.0) * few**2
+        return math.sqrt(min(own**2, blurred + self.alike * own**2))
 
     def tolerances(self, rays: int, finest: float) -> tuple[float, ...]:
         """Tolerances of the rank to consider: the finest, and those that leave out as much as there is noise, or twice.
@@ -140,8 +157,12 @@ class GatherCosts:
         dense = EXPANSION * expanded + rows * rank * self.directions * self.channels + squares
         bounces = nodes * entries * rank * (1 + LATER * self.channels)
         sparse = bounces + min(rows, nodes) * entries * self.directions * self.channels
-        made = nodes * rays * self.ray + COMBINED * nodes * (rank + BLOCKS)
-        return made + self.multiplication * dense + self.addition * sparse
+        made = (
+            nodes * (rays + min(rays, OTHERS)) * self.ray
+            + COMBINED * nodes * (rank + BLOCKS)
+            + SMOOTHED * nodes
+        )
+        return made + self.depths * (self.multiplication * dense + self.addition * sparse)
 
 
 def gather_costs(
@@ -180,11 +201,45 @@ def gather_costs(
         addition,
         len(many[0].data) / (MANY * len(held.vertices)),
         dict(zip((FEW, MANY), np.sqrt(noise).tolist(), strict=True)),
+        *_averaging(direct, held, seeds, stream),
         math.sqrt(max(bias, 0.0)),
         sizes[0],
         max(sizes[1] / max(sizes[0], 1e-150), 1.0),
         pilot.spectra(stream),
+        max(1, direct.problem.depths_apart),
     )
+
+
+def _averaging(
+    direct: DirectSolver, held: PilotElements, seeds: Sequence[int], stream: np.random.SeedSequence
+) -> tuple[float, float]:
+    """What averaging between neighbours leaves of the square of the noise of few rays, and if these were alike.
+
+    As ``reconstruction.gather_noise`` has it, of whose levels of smoothing this is the first. Half of the texels say
+    where it is worth it, the others how much.
+    """
+    rng, count = np.random.default_rng(stream), len(held.vertices)
+    chosen = np.sort(
+        rng.choice(count, min(count, AVERAGED), replace=False, p=held.stand_for / held.stand_for.sum())
+    )
+    weights, seen = nearest_weights(direct.problem.scene, direct.points, held.vertices[chosen])
+    pilot, texels = _Pilot(direct, seen), np.unique(held.texels[chosen])
+    texels = np.sort(rng.choice(texels, min(len(texels), held.texels.shape[1]), replace=False))
+    asked = np.tile(texels, (len(seen), 1))
+    x, y = (pilot.light(pilot.rays(FEW, seed), asked).reshape(len(seen), -1) for seed in seeds)
+    own = np.searchsorted(seen, held.vertices[chosen])
+    noise = np.square(x[own] - y[own]) / 2
+    if not noise.any():
+        return 1.0, 1.0
+    blurred = sum(np.square(weights @ a - b[own]) for a, b in ((x, y), (y, x))) / 2 - noise
+    alike = np.asarray(weights.power(2).sum(axis=1))
+    left = np.zeros(2)
+    for judges, judged in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
+        better = blurred[:, judges].sum(axis=1) < noise[:, judges].sum(axis=1)
+        rest = noise[:, judged].sum(axis=1)
+        left += np.where(better, [blurred[:, judged].sum(axis=1), alike * rest], rest).sum(axis=1)
+    averaged, even = np.clip(left / noise.sum(), 0.0, 1.0)
+    return float(averaged), float(min(even, averaged))
 
 
 def _typical(held: PilotElements, squares: NDArray[np.float64]) -> float:

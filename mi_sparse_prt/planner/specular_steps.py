@@ -55,6 +55,11 @@ class SpecularSteps:
         return 0.0 if self._own else min(self._aim, self._search.error)
 
     @property
+    def most(self) -> bool:
+        """Whether most of the light that arrives, by energy, has come by way of mirrors and glass."""
+        return self._search.error**2 > 0.5 * self._search.noise**2
+
+    @property
     def done(self) -> bool:
         """Whether there is no more noise than is aimed at, or enough."""
         return self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)

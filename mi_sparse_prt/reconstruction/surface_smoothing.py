@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -52,31 +53,67 @@ def smoothing_levels(
         One after another. Rows sum to 1. Neighbours face the same way, and no wall is between them.
     """
     chosen, walls = np.arange(len(points)) if vertices is None else vertices, Walls(scene, points)
-    bounds = [np.searchsorted(chosen, (mesh.vertices.start, mesh.vertices.stop)) for mesh in scene.meshes]
-    meshes = [chosen[a:b] for a, b in bounds]
-    return [
-        scipy.sparse.block_diag(
-            [_smoothed(scene, points, walls, ids, stride) for ids in meshes], "csr", np.float32
-        )
-        for stride in STRIDES
-    ]
+    levels = []
+    for stride in STRIDES:
+        every: list[_Entries] = []
+        for mesh in scene.meshes:
+            ids = chosen[slice(*np.searchsorted(chosen, (mesh.vertices.start, mesh.vertices.stop)))]
+            every.append(_weights(scene, walls, ids, _thinned(scene, points, ids, stride)))
+        levels.append(_matrix(every, chosen, chosen))
+    return levels
 
 
-def _smoothed(
-    scene: Scene, points: Points, walls: Walls, ids: NDArray[np.int64], stride: int
-) -> scipy.sparse.coo_array:
-    """One level on a mesh: about every so many of its vertices are looked at."""
-    p, n, size = scene.normalised_positions[ids], scene.normals[ids], len(ids)
-    count = max(size // stride, min(size, NEAR))
-    seen = np.sort(morton_order(p, points.keys[ids])[(2 * np.arange(count) + 1) * size // (2 * count)])
-    near = surface_neighbours(p, n, p[seen], n[seen], NEAR, looked_through=1)
-    near = walls.without_hidden(ids, near, ids[seen])
-    weights = linear_weights(near, p, n, p[seen], n[seen])
+def nearest_weights(
+    scene: Scene, points: Points, vertices: NDArray[np.int64]
+) -> tuple[scipy.sparse.csr_array, NDArray[np.int64]]:
+    """The first level at some vertices, ascending: weights (k, m), and the vertices (m,) whose light these take."""
+    walls = Walls(scene, points)
+    every: list[_Entries] = []
+    for mesh in scene.meshes:
+        bounds = np.searchsorted(vertices, (mesh.vertices.start, mesh.vertices.stop))
+        inside = np.arange(mesh.vertices.start, mesh.vertices.stop)
+        every.append(_weights(scene, walls, vertices[slice(*bounds)], inside))
+    seen = np.unique(np.concatenate([entries.columns for entries in every]))
+    return _matrix(every, vertices, seen), seen
+
+
+class _Entries(NamedTuple):
+    """Of a sparse matrix: rows and columns by the scene's numbers of vertices."""
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    values: Floats
+
+
+def _matrix(
+    every: list[_Entries], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> scipy.sparse.csr_array:
+    """Of some vertices, by ascending numbers."""
+    row, column, values = (np.concatenate(part) for part in zip(*every, strict=True))
+    places = np.searchsorted(rows, row).astype(np.int32), np.searchsorted(columns, column).astype(np.int32)
+    return scipy.sparse.csr_array((values, places), shape=(len(rows), len(columns)), dtype=np.float32)
+
+
+def _thinned(scene: Scene, points: Points, ids: NDArray[np.int64], stride: int) -> NDArray[np.int64]:
+    """About every so many vertices of a mesh, evenly spread; enough of them for a neighbourhood, if there are."""
+    count = max(len(ids) // stride, min(len(ids), NEAR))
+    order = morton_order(scene.normalised_positions[ids], points.keys[ids])
+    return ids[np.sort(order[(2 * np.arange(count) + 1) * len(ids) // max(2 * count, 1)])]
+
+
+def _weights(scene: Scene, walls: Walls, ids: NDArray[np.int64], seen: NDArray[np.int64]) -> _Entries:
+    """Of the nearest of those seen, in the light of vertices of the same mesh."""
+    p, n = scene.normalised_positions, scene.normals
+    near = surface_neighbours(p[ids], n[ids], p[seen], n[seen], NEAR, looked_through=1)
+    near = walls.without_hidden(ids, near, seen)
+    weights = linear_weights(near, p[ids], n[ids], p[seen], n[seen])
     row, place = np.nonzero(near.ids >= 0)
-    alone = np.flatnonzero(near.ids[:, 0] < 0)  # sees none of these, and keeps its own value
-    entries = np.concatenate([weights[row, place], np.ones(len(alone), np.float32)])
-    columns = np.concatenate([seen[near.ids[row, place]], alone])
-    return scipy.sparse.coo_array((entries, (np.concatenate([row, alone]), columns)), shape=(size, size))
+    alone = ids[near.ids[:, 0] < 0]  # see none of these, and keep their own value
+    return _Entries(
+        np.concatenate([ids[row], alone]),
+        np.concatenate([seen[near.ids[row, place]], alone]),
+        np.concatenate([weights[row, place], np.ones(len(alone), np.float32)]),
+    )
 
 
 class SurfaceSmoothing:

@@ -219,7 +219,21 @@ def test_noise_of_rays_is_not_worth_a_rank():
     def costs(noise: float) -> GatherCosts:
         spectra = np.zeros((2, 4))
         return GatherCosts(
-            100, 100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, {64: noise, 256: noise / 2}, 0.0, 0.1, 1.2, spectra
+            100,
+            100,
+            96,
+            1,
+            1e-7,
+            1e-11,
+            1e-10,
+            0.5,
+            {64: noise, 256: noise / 2},
+            1.0,
+            1.0,
+            0.0,
+            0.1,
+            1.2,
+            spectra,
         )
 
     assert costs(0.02).tolerances(64, 0.06) == (0.06, 0.2, 0.4)
@@ -249,6 +263,8 @@ def test_a_rank_grows_as_it_did_within_the_sample():
             0,
             0.5,
             {64: 0.1, 256: 0.05},
+            1,
+            1,
             0,
             0.1,
             1,
@@ -493,7 +509,8 @@ def test_predicted_errors_are_those_of_the_matrix():
 
     Expected: the pilot's 192 vertices and the check's elements know it within some percent each. Predicted over
     estimated errors were, in mean and standard deviation over eight seeds, 0.969 +- 0.038, 0.962 +- 0.030 and
-    1.048 +- 0.039; one seed is within three of the latter of the former.
+    1.115 +- 0.111; one seed is within three of the latter of the former. Of the noise of gather rays, a pilot knows
+    what one level of smoothing leaves, of three.
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
     direct = DirectSolver(problem_at(scene, lighting))
@@ -502,7 +519,7 @@ def test_predicted_errors_are_those_of_the_matrix():
     plans = [
         (Plan("exact", "paths", resolution=8, spp=4), costs.paths.error(8, 4), 0.969, 0.038),
         (Plan("exact", "paths", resolution=4, spp=8), costs.paths.error(4, 8), 0.962, 0.030),
-        (Plan("exact", "gather", 64, 0.06), costs.gather.error(64, 0.06), 1.048, 0.039),
+        (Plan("exact", "gather", 64, 0.06), costs.gather.error(64, 0.06), 1.115, 0.111),
     ]
     for plan, predicted, mean, deviation in plans:
         found = prt.precompute(scene, lighting, plan, progress=False).report["estimated_error"]["total"]
