@@ -33,6 +33,7 @@ from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import Gathered, GatheredByDepth, RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularLight, SpecularOptions, specular_light
+from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.transport import LightTransport
@@ -145,7 +146,7 @@ class Execution:
         assert known.direct is not None  # it is the first light that bounces
         with clock.phase("gather_rays"):
             nodes = choose_nodes(problem.scene, sources.points)
-            noise = GatherNoise(sources, nodes, plan.rays, self._run.seed)
+            noise = self._averaging(plan, sources, nodes)
             gather = RadiositySolver(sources, plan.rays, self._run.seed, nodes, averaging=noise)
         with clock.phase("interreflection"):
             specular = None if known.specular is None else known.specular.operator
@@ -157,6 +158,10 @@ class Execution:
         if known is not light:
             rays["direct"] += known.rays["direct"]
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
+
+    def _averaging(self, plan: Plan, sources: Problem, nodes: Nodes) -> GatherNoise | None:
+        """What averages out the noise of rays, if the plan asks for it."""
+        return GatherNoise(sources, nodes, plan.rays, self._run.seed) if plan.averaged else None
 
     def _direct_of(self, sources: Problem) -> MethodResult:
         """Direct and specular light of the vertices, which send it on to other points."""
@@ -173,10 +178,8 @@ class Execution:
             problem, seed = self._problem, self._run.seed
             nodes = choose_nodes(problem.scene, problem.points)
             specular = None if light.specular is None else light.specular.operator
-            averaging = GatherNoise(problem, nodes, plan.rays, seed)
-            part, noise = glossy_indirect(
-                problem, direct, plan.rays, plan.tolerance, nodes, seed, specular, averaging
-            )
+            averaging, options = self._averaging(plan, problem, nodes), (plan.rays, plan.tolerance)
+            part, noise = glossy_indirect(problem, direct, *options, nodes, seed, specular, averaging)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays}
         # the rank that leaves this out grows with the rays, too

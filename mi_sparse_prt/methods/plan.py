@@ -12,7 +12,7 @@ INDIRECT = ("none", "gather", "sparse", "paths", "huang2010")
 TOGETHER = ("sparse", "huang2010")  # evaluate both parts at the same elements
 PARAMETERS = {
     "none": (),
-    "gather": ("rays", "tolerance"),
+    "gather": ("rays", "tolerance", "averaged"),
     "sparse": ("dense", "spp"),
     "paths": ("resolution", "spp"),
     "huang2010": ("spp",),
@@ -35,6 +35,8 @@ class Plan:
         left out under any plan.
     rays, tolerance : int, float
         Of ``"gather"``: rays per vertex, and the relative error of the first bounce that a low rank may cost.
+    averaged : bool
+        Of ``"gather"``: whether the noise of rays is averaged out along surfaces (``reconstruction.gather_noise``).
     dense : float, optional
         Of ``"sparse"``: the share of the vertices that is dense, about a fifth if not given.
     resolution, spp : int, optional
@@ -51,6 +53,7 @@ class Plan:
     indirect: str = "none"
     rays: int = 256
     tolerance: float = 0.03
+    averaged: bool = True
     dense: float | None = None
     resolution: int | None = None
     spp: int | None = None

@@ -241,7 +241,7 @@ def learned(costs: Costs, plan: Plan, found: HeldOutError) -> Costs:
     costs = replace(costs, fixed=(1 + ROUND) * costs.check)
     if costs.gather is None or plan.indirect != "gather":
         return costs
-    gather = costs.gather.learned(plan.rays, plan.tolerance, found.parts["indirect"])
+    gather = costs.gather.learned(plan, found.parts["indirect"])
     costs = with_direct(costs, plan.direct, found.parts["direct"])
     return replace(costs, gather=gather, specular=found.parts.get("specular", 0.0))
 
@@ -271,8 +271,9 @@ def _indirect(costs: Costs, direct: str, room: float, spp: int | None) -> Iterat
     if costs.gather is not None:
         for rays, finest in GATHER:
             for tolerance in (finest,) if costs.bent else costs.gather.tolerances(rays, finest):
-                cost = costs.gather.seconds(rays, tolerance), costs.gather.error(rays, tolerance)
-                yield Plan(direct, "gather", rays, tolerance), *cost
+                for averaged in (True, False):
+                    how = rays, tolerance, averaged
+                    yield Plan(direct, "gather", *how), costs.gather.seconds(*how), costs.gather.error(*how)
     for resolution, seconds in costs.paths.seconds.items():
         samples = costs.paths.samples(resolution, room) if spp is None else spp
         plan = Plan(direct, "paths", resolution=resolution, spp=samples)

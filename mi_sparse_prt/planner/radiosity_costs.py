@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.reconstruction.gather_noise import OTHERS
 from mi_sparse_prt.reconstruction.node_placement import node_count
 from mi_sparse_prt.reconstruction.surface_smoothing import nearest_weights
@@ -39,7 +40,10 @@ BLOCKS = 192  # ... and as many of these are begun at least
 DISTINCT = 1.2  # tolerances that are closer than this factor are as good as one
 LEFT = 2.0  # times the noise of rays may be left out
 AVERAGED = 128  # vertices whose neighbours tell what averaging between these leaves of the noise
-SMOOTHED = 15e-6  # seconds of a node to find its neighbours for that, most of it for k-d trees
+SMOOTHED = 20e-6  # seconds of a node to find its neighbours for that, most of it for k-d trees
+AVERAGING = (
+    64  # additions for each number of left factors: three levels of 12 neighbours, their shares and sums
+)
 LATER = 2  # bounces after the first one
 GROUPS = 5  # of vertices, for a bias that a few of them do not decide
 
@@ -95,42 +99,41 @@ class GatherCosts:
     spectra: NDArray[np.float64]
     depths: int = 1
 
-    def error(self, rays: int, tolerance: float) -> float:
+    def error(self, rays: int, tolerance: float, averaged: bool = True) -> float:
         """Predicted relative L2 error of the whole matrix.
 
         Of the first bounce's errors only the bias is carried on into the next ones: noise, and what a low rank leaves
         out, differ from vertex to vertex and are averaged by gathering.
         """
-        noise, bias = self.noise(rays), self.growth * self.bias
+        noise, bias = self.noise(rays, averaged), self.growth * self.bias
         return math.sqrt(noise**2 + bias**2 + (tolerance * self.first) ** 2)
 
-    def learned(self, rays: int, tolerance: float, error: float) -> GatherCosts:
+    def learned(self, plan: Plan, error: float) -> GatherCosts:
         """The same, after this error was found: the bias is what a pilot knows least."""
-        bias = math.sqrt(
-            max(error**2 - self.error(rays, tolerance) ** 2 + (self.growth * self.bias) ** 2, 0.0)
-        )
-        return replace(self, bias=bias / self.growth)
+        known = self.error(plan.rays, plan.tolerance, plan.averaged) ** 2 - (self.growth * self.bias) ** 2
+        return replace(self, bias=math.sqrt(max(error**2 - known, 0.0)) / self.growth)
 
-    def noise(self, rays: int) -> float:
-        """Relative L2 error of the whole matrix that comes from the number of rays, averaged between neighbours.
+    def noise(self, rays: int, averaged: bool = True) -> float:
+        """Relative L2 error of the whole matrix that comes from the number of rays.
 
-        What averaging blurs is the same for any number of rays.
+        What averaging between neighbours blurs is the same for any number of rays.
         """
         few, many = (max(self.noise_of[count], 1e-12) for count in (FEW, MANY))
         fall = math.log(few / many) / math.log(MANY / FEW)
         own = self.noise_of[MANY] * (MANY / rays) ** min(max(fall, 0.5), 1.0)
-        blurred = max(self.averaged - self.alike, 0.0) * few**2
-        return math.sqrt(min(own**2, blurred + self.alike * own**2))
+        blurred = max(self.averaged - self.alike, 0.0) * self.noise_of[FEW] ** 2
+        return math.sqrt(min(own**2, blurred + self.alike * own**2)) if averaged else own
 
     def tolerances(self, rays: int, finest: float) -> tuple[float, ...]:
         """Tolerances of the rank to consider: the finest, and those that leave out as much as there is noise, or twice.
 
         Noise differs from vertex to vertex, and has the full rank: to keep more than it is to keep noise. Under
         foliage, 256 rays a vertex: 8% of noise take a rank of 1056 and 21 s, 15% one of 200 and 7 s, as near to 1024
-        rays.
+        rays. Averaged between neighbours there is less of it, and more light to be told from it.
         """
-        found, noise = [finest], self.noise(rays) / max(self.first, 1e-150)
-        for tolerance in (round(noise, 2), round(LEFT * noise, 2)):
+        averaged, own = (self.noise(rays, how) / max(self.first, 1e-150) for how in (True, False))
+        found = [finest]
+        for tolerance in (round(averaged, 2), round(own, 2), round(LEFT * own, 2)):
             if DISTINCT * found[-1] < tolerance < 1:
                 found.append(tolerance)
         return tuple(found)
@@ -148,7 +151,7 @@ class GatherCosts:
         grown = whole * max(whole / max(half, 1.0), 1.0) ** doublings * (seen / tolerance) ** 0.4
         return min(grown, self.vertices, self.directions, USUAL.most)
 
-    def seconds(self, rays: int, tolerance: float) -> float:
+    def seconds(self, rays: int, tolerance: float, averaged: bool = True) -> float:
         """Predicted time of rays and interreflections: the terms are the steps of ``solvers.first_bounce``."""
         nodes, rank, entries = self.nodes, self.rank(tolerance), rays * self.entries
         rows = max(USUAL.few_rows, USUAL.rows * rank)
@@ -157,11 +160,10 @@ class GatherCosts:
         dense = EXPANSION * expanded + rows * rank * self.directions * self.channels + squares
         bounces = nodes * entries * rank * (1 + LATER * self.channels)
         sparse = bounces + min(rows, nodes) * entries * self.directions * self.channels
-        made = (
-            nodes * (rays + min(rays, OTHERS)) * self.ray
-            + COMBINED * nodes * (rank + BLOCKS)
-            + SMOOTHED * nodes
-        )
+        made = nodes * rays * self.ray + COMBINED * nodes * (rank + BLOCKS)
+        if averaged:
+            made += nodes * (SMOOTHED + min(rays, OTHERS) * self.ray)
+            sparse += nodes * AVERAGING * rank * self.channels
         return made + self.depths * (self.multiplication * dense + self.addition * sparse)
 
 

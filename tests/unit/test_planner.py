@@ -56,17 +56,18 @@ class FakeGather(GatherCosts):
     def __init__(self) -> None:
         pass
 
-    def seconds(self, rays: int, tolerance: float) -> float:
+    def seconds(self, rays: int, tolerance: float, averaged: bool = True) -> float:
         return rays / 100
 
-    def error(self, rays: int, tolerance: float) -> float:
+    def error(self, rays: int, tolerance: float, averaged: bool = True) -> float:
         return 0.08 / math.sqrt(rays / 16)
 
     def tolerances(self, rays: int, finest: float) -> tuple[float, ...]:
         return (finest,)
 
-    def learned(self, rays: int, tolerance: float, error: float) -> GatherCosts:
-        return BiasedGather(math.sqrt(max(error**2 - FakeGather.error(self, rays, tolerance) ** 2, 0.0)))
+    def learned(self, plan: Plan, error: float) -> GatherCosts:
+        known = FakeGather.error(self, plan.rays, plan.tolerance)
+        return BiasedGather(math.sqrt(max(error**2 - known**2, 0.0)))
 
 
 class BiasedGather(FakeGather):
@@ -75,7 +76,7 @@ class BiasedGather(FakeGather):
     def __init__(self, bias: float) -> None:
         self.of_bias = bias
 
-    def error(self, rays: int, tolerance: float) -> float:
+    def error(self, rays: int, tolerance: float, averaged: bool = True) -> float:
         return math.hypot(super().error(rays, tolerance), self.of_bias)
 
 
@@ -207,7 +208,7 @@ def test_gathering_learns_its_bias(grey_scene):
     costs = measure(direct, Settings(4, max_depth=4), indirect=True).gather
     assert costs is not None
     for error in (0.5 * costs.error(64, 0.06), 2 * costs.error(64, 0.06)):
-        now = costs.learned(64, 0.06, error)
+        now = costs.learned(Plan("edges", "gather", 64, 0.06), error)
         least = math.hypot(costs.noise(64), 0.06 * costs.first)
         assert now.error(64, 0.06) == pytest.approx(max(error, least))
         assert now.error(1024, 0.06) <= now.error(256, 0.06) <= now.error(64, 0.06)
@@ -429,7 +430,7 @@ def test_a_report_is_json():
     found = best(Costs(0, BOTH, PATHS, FakeGather()), 0.05)
     report = found.report(True)
     assert json.loads(json.dumps(report)) == report
-    assert report["parameters"] == {"rays": 64, "tolerance": 0.06}
+    assert report["parameters"] == {"rays": 64, "tolerance": 0.06, "averaged": True}
     assert report["chosen"] and report["direct"] == "consensus"
 
 
