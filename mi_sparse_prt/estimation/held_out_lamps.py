@@ -15,7 +15,9 @@ from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
 
 POINTS = 256  # of each group, at most
-ELEMENTS = 1 << 14  # of all, about: where groups and lamps are many, each has fewer points
+# of all, about: where groups and lamps are many, each has fewer points. Twice as many told no more of a kitchen: 2.1 to
+# 2.9% by four seeds
+ELEMENTS = 1 << 13
 SPP = 256  # of 64, those of a lamp behind glass told an error of 0
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 
