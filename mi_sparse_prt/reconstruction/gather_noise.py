@@ -18,7 +18,7 @@ from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 OTHERS = 64  # rays of a vertex, at most, that tell the noise of its own
-STREAM = 7  # spawn key
+STREAM = 10  # spawn key
 COLUMNS = 64  # that are smoothed at a time
 
 Floats = NDArray[np.float32]
