@@ -420,9 +420,11 @@ def test_nothing_to_gather(why, monkeypatch):
     assert not gather.apply(np.ones((scene.n_vertices, 2), np.float32)).any()
 
 
-def test_coloured_light_is_told_apart_by_depth():
+@pytest.mark.parametrize("alike", [True, False])
+def test_coloured_light_is_told_apart_by_depth(alike: bool):
     """
-    Rationale: all channels of light that came by way of coloured glass share a random basis.
+    Rationale: all channels of light that came by way of coloured glass share a random basis, also where each has form
+        factors of its own, as between glossy surfaces.
 
     Expected: each channel and each depth is X_s = sum over k < s of G_k rho (E_(s-1-k) + X_(s-1-k)), as dense products
         have it.
@@ -437,10 +439,12 @@ def test_coloured_light_is_told_apart_by_depth():
     direct = SparseRows((sparse(m, 0.5),))
     specular = ByDepth(tuple(SparseRows(tuple(sparse(m, 0.1) for _ in range(3))) for _ in range(count)))
     keys = rng.integers(1 << 63, size=n).astype(np.uint64)
-    elements = FiniteElements([matrices], albedo, keys, Nodes(np.arange(n), None), 2 + count, 1)
+    of_channels = [matrices] if alike else [[m * np.float32(x) for m in matrices] for x in (1, 0.3, 1.4)]
+    elements = FiniteElements(of_channels, albedo, keys, Nodes(np.arange(n), None), 2 + count, 1)
     found = elements.indirect(direct, 1e-3, specular)
     assert len(found.terms) == count
     for c in range(3):
+        matrices = of_channels[min(c, len(of_channels) - 1)]
         light = [direct.matrices[0].toarray(), *(term.matrices[c].toarray() for term in specular.terms)]
         known = [np.zeros((n, m))]
         for s in range(1, count + 1):
@@ -449,3 +453,25 @@ def test_coloured_light_is_told_apart_by_depth():
         for term, wanted in zip(found.terms, known[1:], strict=True):
             off = term.left[c] @ term.right[c] - wanted
             assert np.linalg.norm(off) < 3e-3 * np.linalg.norm(wanted)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_coloured_light_that_is_not_told_apart(alike: bool):
+    """Expected: G rho (D + E) + G rho G rho (D + E) + ... of each channel, as dense products have it."""
+    n, m, rng = 120, 96, np.random.default_rng(6)
+
+    def sparse(columns: int, density: float) -> scipy.sparse.csr_array:
+        return scipy.sparse.random_array((n, columns), density=density, rng=rng, dtype=np.float32).tocsr()
+
+    matrix, albedo = sparse(n, 0.1) * np.float32(0.1), rng.random((3, n), dtype=np.float32)
+    direct, specular = SparseRows((sparse(m, 0.5),)), SparseRows(tuple(sparse(m, 0.1) for _ in range(3)))
+    keys = rng.integers(1 << 63, size=n).astype(np.uint64)
+    of_channels = [matrix] if alike else [matrix * np.float32(x) for x in (1, 0.3, 1.4)]
+    elements = FiniteElements([[g] for g in of_channels], albedo, keys, Nodes(np.arange(n), None), 4, 1)
+    found = elements.indirect(direct, 1e-3, specular)
+    for c in range(3):
+        step = of_channels[min(c, len(of_channels) - 1)].toarray() * albedo[c]
+        light = (direct.matrices[0] + specular.matrices[c]).toarray()
+        wanted = step @ light + step @ (step @ light)
+        off = found.left[c] @ found.right[c] - wanted
+        assert np.linalg.norm(off) < 3e-3 * np.linalg.norm(wanted)

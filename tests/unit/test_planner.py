@@ -245,6 +245,47 @@ def test_noise_of_rays_is_not_worth_a_rank():
     assert costs(0.2).tolerances(64, 0.06) == (0.06,)  # more noise than light: nothing is to be told from it
 
 
+def test_noise_that_is_averaged():
+    """
+    Expected: of 2% of noise, of whose square averaging leaves a quarter, a tenth if all light were even: 1%, and of
+        four times the rays the blur and a tenth of their own; or what these have without, if that is less. Tolerances
+        that go with either noise are considered.
+    """
+    noise, rest = {64: 0.02, 256: 0.01}, (0.0, 0.1, 1.2, np.zeros((2, 4)))
+    costs = GatherCosts(100, 100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, noise, 0.25, 0.1, *rest)
+    assert costs.noise(64, False) == pytest.approx(0.02)
+    assert costs.noise(64) == pytest.approx(0.01)
+    assert costs.noise(256) == pytest.approx(math.sqrt(0.15 * 0.02**2 + 0.1 * 0.01**2))
+    assert costs.noise(1024) == pytest.approx(0.005)
+    assert costs.tolerances(64, 0.06) == (0.06, 0.1, 0.2, 0.4)
+    assert costs.seconds(64, 0.06) > costs.seconds(64, 0.06, False)
+
+
+def test_of_plans_that_take_as_long_the_most_exact():
+    """
+    Rationale: where most light came by way of water, a pilot sees next to none of it, and a rank that is a tenth of a
+        second quicker left most of it out.
+    Expected: 3% of the time are given for less error, 4% are not, nor for another kind of direct light; where most
+        light is bent, only the finest tolerance of each number of rays is considered.
+    """
+    plans = [
+        Predicted(Plan(direct, "gather", 64, tolerance), seconds, error)
+        for direct, tolerance, seconds, error in (
+            ("edges", 0.8, 10.0, 0.0152),
+            ("edges", 0.06, 10.29, 0.015),
+            ("edges", 0.03, 10.4, 0.014),
+            ("exact", 0.06, 10.1, 0.01),
+        )
+    ]
+    assert choose(plans, 0.02) == choose(plans, None) == plans[1]
+    noise, rest = {64: 0.02, 256: 0.01}, (0.0, 0.1, 1.2, np.zeros((2, 4)))
+    gather = GatherCosts(100, 100, 96, 1, 1e-7, 1e-11, 1e-10, 0.5, noise, 0.25, 0.1, *rest)
+    for bent, counts in ((True, 1), (False, 4)):
+        found = predictions(Costs(0, EXACT, PATHS, gather, bent=bent), 0.02)
+        asked = {p.plan.tolerance for p in found if p.plan.indirect == "gather" and p.plan.rays == 64}
+        assert len(asked) == counts
+
+
 def test_a_rank_grows_as_it_did_within_the_sample():
     """
     Expected: that of the sample where half of it has as much, one that is far larger where all of it has twice as
