@@ -35,7 +35,8 @@ class MethodResult:
         Of methods that leave elements out: per mesh, how many vertices and directions were taken.
     radiosity : dict
         Of finite elements: ``ranks`` per channel, ``bounces``, and of glossy scenes ``noise_of_rays`` (relative L2, in
-        the first bounce) and ``error_of_rays`` (at most so much of the matrix's error can more rays take away).
+        the first bounce, before it is averaged) and ``error_of_rays`` (at most so much of the matrix's error can more
+        rays take away).
     dense : (k,) int64 or None
         Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
     """

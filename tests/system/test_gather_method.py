@@ -103,7 +103,7 @@ def test_a_target_error_is_met_by_more_rays():
     scene = build(FINE, **still_life(GREY))
     loose, tight = (
         prt.precompute(scene, LIGHTING, method="gather", target_error=target, progress=False).report
-        for target in (0.5, 0.012)
+        for target in (0.5, 0.006)
     )
     n = len(scene.positions)
     assert loose["rays"]["gather"] == 64 * n
