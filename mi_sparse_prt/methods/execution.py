@@ -154,7 +154,7 @@ class Execution:
                 part = gather.indirect(known.direct, plan.tolerance, specular)
             else:
                 part = gather.seen_from(problem, known.direct, plan.tolerance, specular)
-        rays = light.rays | {"gather": gather.rays}
+        rays = light.rays | {"gather": gather.rays} | _rays_of(noise)
         if known is not light:
             rays["direct"] += known.rays["direct"]
         return replace(light, indirect=part, rays=rays, skipped=_left_out(part), radiosity=_account(part))
@@ -181,7 +181,7 @@ class Execution:
             averaging, options = self._averaging(plan, problem, nodes), (plan.rays, plan.tolerance)
             part, noise = glossy_indirect(problem, direct, *options, nodes, seed, specular, averaging)
         starts = len(np.union1d(nodes.ids, direct.glossy))
-        rays = light.rays | {"gather": starts * plan.rays}
+        rays = light.rays | {"gather": starts * plan.rays} | _rays_of(averaging)
         # the rank that leaves this out grows with the rays, too
         refinable = math.hypot(noise.bounce, part.left_out) * noise.share
         account = _account(part) | {"noise_of_rays": noise.bounce, "error_of_rays": refinable}
@@ -220,6 +220,10 @@ class Execution:
         state = f"{self._problem.scene.hash} {self._settings.of(plan)} {plan}".encode()
         state += self._problem.points.keys.tobytes()
         return replace(self._run, state=hashlib.sha256(state).hexdigest()[:32])
+
+
+def _rays_of(averaging: GatherNoise | None) -> dict[str, int]:
+    return {} if averaging is None else {"averaging": averaging.rays}
 
 
 def _account(part: Gathered | GatheredByDepth) -> dict[str, Any]:

@@ -41,9 +41,7 @@ DISTINCT = 1.2  # tolerances that are closer than this factor are as good as one
 LEFT = 2.0  # times the noise of rays may be left out
 AVERAGED = 128  # vertices whose neighbours tell what averaging between these leaves of the noise
 SMOOTHED = 20e-6  # seconds of a node to find its neighbours for that, most of it for k-d trees
-AVERAGING = (
-    64  # additions for each number of left factors: three levels of 12 neighbours, their shares and sums
-)
+AVERAGING = 64  # additions per number of left factors: three levels of 12 neighbours, their shares and sums
 LATER = 2  # bounces after the first one
 GROUPS = 5  # of vertices, for a bias that a few of them do not decide
 

@@ -36,12 +36,19 @@ class GatherNoise:
     rays : int
         Of each.
     seed : int
+
+    Attributes
+    ----------
+    rays : int
+        That were traced.
     """
 
     def __init__(self, problem: Problem, nodes: Nodes, rays: int, seed: int) -> None:
         scene, points, ids = problem.scene, problem.points, nodes.ids
         other = element_seeds(random_stream(seed, STREAM), 1)[0]
-        self._others = gather_matrix(scene, points, min(rays, OTHERS), other, ids, problem.max_depth)
+        rays = min(rays, OTHERS)
+        self._others = gather_matrix(scene, points, rays, other, ids, problem.max_depth)
+        self.rays = rays * len(ids)
         self._albedo = scene.albedo.mean(axis=1)[None]
         self._smoothing = SurfaceSmoothing(smoothing_levels(scene, points, ids))
         self._chosen: NDArray[np.int8] | None = None

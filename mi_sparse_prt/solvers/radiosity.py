@@ -304,11 +304,13 @@ class FiniteElements:
         sums = [np.empty((light.shape[0], min(BITS, light.shape[1])), np.float32) for _ in range(JUDGED)]
         for some in sums:
             combine_randomly(light, self.options.basis.mixed, rng, some)
+        # G_0 alone: what is sent on by way of mirrors is spread as widely, and the sum of all is large
+        matrix, rho = of_channel(self._matrices, 1)[0], of_channel(self._albedo, 1)[None]
         total = sent = np.hstack(sums)
         for _ in range(count - 1):
-            sent = self.nodes.interpolate(self._reflect_one(1, sent))
+            sent = self.nodes.interpolate(multiply_scaled(matrix, rho, sent)[0])
             total = total + sent
-        self.averaging.judge(of_channel(self._matrices, 1)[0], total)
+        self.averaging.judge(matrix, total)
 
     def _spread(self, light: Floats) -> Floats:
         """Light (n_nodes, k) of the nodes, with less noise, at all vertices."""

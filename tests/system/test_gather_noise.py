@@ -95,3 +95,4 @@ def test_a_plan_may_leave_it_out(scene: Scene):
     errors = [x.report["estimated_error"]["parts"]["indirect"] for x in found]
     assert errors[0] < errors[1]
     assert [x.report["plan"]["parameters"]["averaged"] for x in found] == [True, False]
+    assert [x.report["rays"].get("averaging", 0) for x in found] == [RAYS * scene.n_vertices, 0]

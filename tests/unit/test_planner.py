@@ -516,7 +516,8 @@ def test_a_plan_is_carried_out(grey_scene):
     assert np.array_equal(mixed.direct.bits, state.visible)
     evaluated = int(np.bitwise_count(state.evaluated).sum())
     assert mixed.report["elements"]["direct"] == mixed.report["elements_evaluated"] == evaluated
-    assert mixed.report["rays"] == {"direct": evaluated, "gather": 64 * grey_scene.n_vertices}
+    rays = 64 * grey_scene.n_vertices
+    assert mixed.report["rays"] == {"direct": evaluated, "gather": rays, "averaging": rays}
 
 
 # ------------------------------------------------------------------------------------ what is measured
