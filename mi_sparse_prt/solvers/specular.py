@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
@@ -25,17 +26,23 @@ from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
 from mi_sparse_prt.solvers.lamps import LampRays
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Sparse, SpecularChains
+from mi_sparse_prt.solvers.specular_chains import (
+    CELLS,
+    LANES,
+    Cells,
+    Sparse,
+    SpecularChains,
+    Strata,
+    draw_strata,
+)
 
 SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
 ROUNDS = 3  # after the first
-CAUTION = (
-    0.5  # of the rays that seem to be asked for: the first ones know little of what better placed ones gain
-)
 ENOUGH = (
-    1.25  # times the squared noise that is wanted, after a round: another has a ray in each cell at least
+    1.25  # times the squared noise that is wanted, after a round: the noise itself is known about as well
 )
+LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
@@ -49,9 +56,10 @@ class SpecularOptions:
 
     Attributes
     ----------
-    first : int
+    first : float
         Strata per axis of a cell of the hemisphere, each with a ray, in each of two independent halves; fewer where
-        what is seen sends on a small share of light, unless as many as ``last``.
+        what is seen sends on a small share of light, unless as many as ``last``. Where less than 1, some cells stand
+        for others.
     last : int
         At most; cells from which more light arrives have more, until the noise is small enough.
     error : float
@@ -60,7 +68,7 @@ class SpecularOptions:
         Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
 
-    first: int = 1
+    first: float = 0.5
     last: int = 16
     error: float = 0.0
     strata: int = 2
@@ -191,8 +199,10 @@ class SpecularSearch:
 
     def refine(self, error: float, noise: float = 0.0) -> None:
         """Trace more rays until either is about so much: noise relative to all light, or to specular light alone."""
-        share = error**2 / max(len(self._parts), 1)
         for part in self._parts:
+            square = sum(p.total.square for p in self._parts) + self._direct
+            others = sum(p.total.noise for p in self._parts if p is not part) / max(square, 1e-300)
+            share = max(error**2 - others, error**2 / len(self._parts))
             part.refine(_Limit(share, share * self._direct, noise**2))
 
     def light(self) -> SpecularLight:
@@ -223,7 +233,7 @@ class _Mean:
         self, total: _Estimate, sample: Callable[[float], tuple[_Estimate, bool]] | None = None
     ) -> None:
         self.total, self._sample = total, sample
-        self._trust, self._enough = 1.0, 1.0
+        self._enough = 1.0
 
     def refine(self, limit: _Limit) -> None:
         """Add estimates until the noise is small enough."""
@@ -231,9 +241,8 @@ class _Mean:
             bound = limit.of(self.total.square)
             if self._sample is None or self.total.noise <= self._enough * bound:
                 break
-            wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / self.total.noise) / CAUTION
-            found, finest = self._sample(wanted * self._trust)
-            self._trust *= min(wanted / max(found.noise, 1e-300), 1)
+            wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / self.total.noise)
+            found, finest = self._sample(wanted)
             self.total, self._enough = _mean_of(self.total, found), ENOUGH
             if finest:
                 self._sample = None
@@ -245,57 +254,56 @@ class _Arriving:
     def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
         self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
         self._size = problem.emission.size * max(problem.depths_apart, 1)
+        self._keys = problem.points.keys[np.asarray(ids)]
         self._cells = self._chains.find_cells(ids, next(self._seeds))
+        self._moments = _Moments(self._cells, power.max(axis=1))
 
     def estimated(self, options: SpecularOptions) -> _Mean:
-        """As many strata as the noise asks for; the first ones say where light comes from.
+        """As many rays as the noise asks for; those before say where light comes from.
 
-        Rays are best in proportion to what they spread by; first, that is the share of light that surfaces send on.
+        First, rays are in proportion to the share of light that surfaces send on.
         """
-        found = len(self._ids) * CELLS**2
+        found, most = len(self._ids) * CELLS**2, max(int(options.last), 1)
         if options.first >= options.last:
-            only, _ = self._sampled(np.full(len(self._cells.rows), options.first))
+            only = self._sampled(np.full(len(self._cells.rows), float(options.first**2)), most)
             return _Mean(only._replace(rays=found + only.rays))
-        across = np.rint(options.first * np.sqrt(self._cells.shares))
-        strata = np.clip(across, 1, options.first).astype(np.int64)
-        first, squares = self._sampled(strata)
-        first = first._replace(rays=found + first.rays)
-        n = 2 * strata**2
-        # moments of weights, as if there were one average ray more; numbers of rays are proportional to their roots
-        second = (squares + squares.sum() / max(n.sum(), 1)) / (n + 1)
-        best = np.sqrt(second * self._power.max(axis=1)[self._cells.rows])
-        noise_of_one = first.noise * best.sum() / max((best**2 / strata**2).sum(), 1e-300)
+        shares = np.clip(self._cells.shares.astype(np.float64), LEAST_SHARE, 1)
+        first = self._sampled(options.first**2 * shares, most)
 
         def sample(wanted: float) -> tuple[_Estimate, bool]:
-            across = np.rint(np.sqrt(best * (noise_of_one / wanted)))
-            strata = np.clip(across, 1, options.last).astype(np.int64)
-            return self._sampled(strata)[0], bool((strata == options.last).all())
+            rays = np.minimum(self._moments.best_rays(wanted), float(most**2))
+            return self._sampled(rays, most), bool((rays == most**2).all())
 
-        return _Mean(first, sample)
+        return _Mean(first._replace(rays=found + first.rays), sample)
 
-    def _sampled(self, strata: NDArray[np.int64]) -> tuple[_Estimate, NDArray[np.float64]]:
-        """Light from rays into cells, twice; and the squared weights of rays of each cell, summed."""
-        halves, squares = [], np.zeros(len(strata))
+    def _sampled(self, rays: Doubles, most: int) -> _Estimate:
+        """Light from so many rays into each cell, about, twice."""
+        halves, traced = [], 0
         for _ in "ab":
-            half, found = self._light(strata, next(self._seeds))
+            seed = next(self._seeds)
+            strata = draw_strata(self._cells, self._keys, rays, most, seed)
+            half, squares = self._light(strata, seed)
+            self._moments.add(strata, squares)
             halves.append(half)
-            squares += found
-        return _compared(halves, self._power, 2 * int((strata**2).sum())), squares
+            traced += int((strata.across**2).sum())
+        total = _compared(halves, self._power, traced)
+        self._moments.noise, self._moments.rays = total.noise, rays
+        return total
 
-    def _light(self, strata: NDArray[np.int64], seed: int) -> tuple[list[Sparse], NDArray[np.float32]]:
+    def _light(self, strata: Strata, seed: int) -> tuple[list[Sparse], NDArray[np.float32]]:
         """Light (points, texels) of each channel, for some points at a time."""
         none = scipy.sparse.csr_array((len(self._ids), self._size), dtype=np.float32)
-        lit, starts = np.unique(self._cells.rows, return_index=True)  # rows are sorted
-        starts = np.append(starts, len(strata))
-        rays = np.concatenate([[0], np.cumsum(strata**2)])[starts]
+        lit, starts = np.unique(strata.cells.rows, return_index=True)  # rows are sorted
+        starts = np.append(starts, len(strata.which))
+        rays = np.concatenate([[0], np.cumsum(strata.across**2)])[starts]
         found, squares, first = [], [np.zeros(0, np.float32)], 0
         while first < len(lit):
             most = int(np.searchsorted(rays, rays[first] + LANES, side="right")) - 1
             last = min(max(most, first + 1), len(lit))
-            part = slice(starts[first], starts[last])
-            here, some = self._ids[lit[first:last]], self._cells.take(part)
-            some = some._replace(rows=np.searchsorted(lit[first:last], some.rows))
-            arrived = self._chains.gather_light(here, some, strata[part], seed)
+            some = strata.take(slice(starts[first], starts[last]))
+            rows = np.searchsorted(lit[first:last], some.cells.rows)
+            some = some._replace(cells=some.cells._replace(rows=rows))
+            arrived = self._chains.gather_light(self._ids[lit[first:last]], some, seed)
             found.append(arrived.light)
             squares.append(arrived.squares)
             first = last
@@ -309,6 +317,51 @@ def _spread(matrix: Sparse, rows: Ids, shape: tuple[int, int]) -> Sparse:
     counts[rows] = np.diff(matrix.indptr)
     starts = np.concatenate([[0], np.cumsum(counts)])
     return scipy.sparse.csr_array((matrix.data, matrix.indices, starts), shape=shape)
+
+
+class _Moments:
+    """Squared weights of rays into cells, which tell where more of them are worth most.
+
+    Attributes
+    ----------
+    noise : float
+        Squared, of the last estimate.
+    rays : (m,) float64
+        Into each cell, by each of its halves.
+    """
+
+    def __init__(self, cells: Cells, power: Doubles) -> None:
+        lit, rows = np.unique(cells.rows, return_inverse=True)
+        self._lit, self._place = len(lit), rows * CELLS**2 + cells.numbers
+        self._power = np.maximum(power, LEAST_SHARE * power.max(initial=0))[
+            cells.rows
+        ]  # black vertices have rays, too
+        self._squares, self._traced = np.zeros(len(rows)), np.zeros(len(rows))
+        self.noise, self.rays = 0.0, np.ones(len(rows))
+
+    def add(self, strata: Strata, squares: Floats) -> None:
+        """What more rays found."""
+        self._squares[strata.which] += squares
+        self._traced[strata.which] += strata.across**2
+
+    def best_rays(self, noise: float) -> Doubles:
+        """Rays (m,) into each cell, of each of two halves, whose mean has so much squared noise, about.
+
+        In proportion to the roots of moments, those of neighbouring cells together, as if there were one average ray
+        more: so is the sum of moments over numbers of rays least. The last estimate says what that is in noise.
+        """
+        average = self._squares.sum() / max(self._traced.sum(), 1)
+        second = (self._around(self._squares) + average) / (self._around(self._traced) + 1)
+        best = np.sqrt(second * self._power)
+        known = (best**2 / np.maximum(self.rays, 1e-30)).sum()
+        return best * best.sum() * (self.noise / max(known, 1e-300) / noise)
+
+    def _around(self, values: Doubles) -> Doubles:
+        """Sums over each cell and those beside it."""
+        grid = np.zeros(self._lit * CELLS**2, np.float32)
+        grid[self._place] = values
+        mean = scipy.ndimage.uniform_filter(grid.reshape(-1, CELLS, CELLS), (0, 3, 3), mode="constant")
+        return np.maximum(9.0 * mean.ravel()[self._place].astype(np.float64), 0)
 
 
 class _Passing:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.ragged import row_starts
-from mi_sparse_prt.core.random_keys import random_generator
+from mi_sparse_prt.core.random_keys import mix, random_generator
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
@@ -60,6 +60,69 @@ class Cells(NamedTuple):
     def take(self, part: slice | NDArray[np.integer]) -> Cells:
         """Some of them."""
         return Cells(self.rows[part], self.numbers[part], self.shares[part])
+
+
+def _bayer(size: int) -> NDArray[np.float64]:
+    """Bayer's matrix (size**2,), size a power of two, of [0, 1): cells of any interval are spread evenly."""
+    numbers = np.zeros((1, 1))
+    while len(numbers) < size:
+        numbers = np.block([[4 * numbers, 4 * numbers + 2], [4 * numbers + 3, 4 * numbers + 1]])
+    return numbers.ravel() / size**2
+
+
+class Strata(NamedTuple):
+    """Cells that rays go into, one into each stratum.
+
+    Attributes
+    ----------
+    cells : Cells
+        (k,) of others; where less than one ray is wanted of each, some of them stand for all.
+    which : (k,) int64
+        Their places among the others.
+    across : (k,) int64
+        Strata per axis.
+    scale : (k,) float32
+        What their light is to be multiplied by.
+    """
+
+    cells: Cells
+    which: NDArray[np.int64]
+    across: NDArray[np.int64]
+    scale: Floats
+
+    @property
+    def shares(self) -> NDArray[np.float64]:
+        """Of all light that a point receives, that each ray stands for (k,)."""
+        return self.scale / (CELLS * self.across.astype(np.float64)) ** 2
+
+    def take(self, part: slice) -> Strata:
+        """Some of them."""
+        return Strata(self.cells.take(part), self.which[part], self.across[part], self.scale[part])
+
+
+def draw_strata(
+    cells: Cells, keys: NDArray[np.uint64], rays: NDArray[np.float64], most: int, seed: int
+) -> Strata:
+    """Strata of cells, as many as rays are wanted of each, about.
+
+    Parameters
+    ----------
+    cells : Cells
+        (m,) of some points.
+    keys : (n,) uint64
+        Of these points.
+    rays : (m,) float64
+        Wanted; where less than one, cells are drawn by that chance, spread evenly over each hemisphere.
+    most : int
+        Strata per axis, at most.
+    seed : int
+    """
+    own = mix(mix(keys ^ np.uint64(seed))) * 2.0**-64
+    chance = np.minimum(rays, 1)
+    drawn = (own[cells.rows] + _bayer(CELLS)[cells.numbers]) % 1
+    which = np.flatnonzero(drawn < chance)
+    across = np.clip(np.rint(np.sqrt(rays[which])), 1, most).astype(np.int64)
+    return Strata(cells.take(which), which, across, (1 / chance[which]).astype(np.float32))
 
 
 class ArrivedLight(NamedTuple):
@@ -132,47 +195,45 @@ class SpecularChains:
             found.append((a + rows[of], number, grown[of, number]))
         return Cells(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
-    def gather_light(self, ids: Ids, cells: Cells, strata: NDArray[np.int64], seed: int) -> ArrivedLight:
+    def gather_light(self, ids: Ids, strata: Strata, seed: int) -> ArrivedLight:
         """Light of texels to which rays from points leave the scene, or of lamps; not of those that went straight on.
 
         Parameters
         ----------
         ids : (n,) integers
             Points.
-        cells : Cells
-            (m,) of these.
-        strata : (m,) int64
-            Per axis of each cell, each with a ray.
+        strata : Strata
+            Of cells of these.
         seed : int
         """
-        rays = self._rays_into(ids, cells, strata, seed)
+        rays = self._rays_into(ids, strata.cells, strata.across, seed)
         gather = self._of_texels if self._of_sky else self._of_lamps
-        return gather(rays, len(ids), cells.rows, strata)
+        return gather(rays, len(ids), strata.cells.rows, strata.shares)
 
     def _of_lamps(
-        self, rays: _Rays, n: int, rows: NDArray[np.int64], strata: NDArray[np.int64]
+        self, rays: _Rays, n: int, rows: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> ArrivedLight:
         """Sums of few columns, however bright, in the order of rays."""
-        sums, squares = np.zeros((3, n * self._size)), np.zeros(len(strata))
+        sums, squares = np.zeros((3, n * self._size)), np.zeros(len(rows))
         for ends in self._follow(*rays, True):
             of, column, weight = kept_ends(ends)
-            share, place = 1 / (CELLS * strata[of].astype(float)) ** 2, rows[of] * self._size + column
+            place = rows[of] * self._size + column
             for total, own in zip(sums, weight, strict=True):
-                np.add.at(total, place, own * share)
+                np.add.at(total, place, own * shares[of])
             np.add.at(squares, of, np.square(weight.max(axis=0), dtype=np.float64))
         light = [scipy.sparse.csr_array(total.reshape(n, -1).astype(np.float32)) for total in sums]
         return ArrivedLight(light, squares.astype(np.float32))
 
     def _of_texels(
-        self, rays: _Rays, n: int, rows_of: NDArray[np.int64], strata: NDArray[np.int64]
+        self, rays: _Rays, n: int, rows_of: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> ArrivedLight:
         """Sums of many columns, of which few are not 0, in the order of rays."""
         of, column, weight = self._follow_to_sky(rays)
-        share = (1 / (CELLS * strata.astype(float)) ** 2).astype(np.float32)
         starts = np.searchsorted(rows_of[of], np.arange(n + 1))
         shape = n, self._size * max(self._apart, 1)
-        squares = np.bincount(of, np.square(weight.max(axis=0), dtype=np.float64), len(strata))
-        return ArrivedLight(_summed(starts, column, weight * share[of], shape), squares.astype(np.float32))
+        squares = np.bincount(of, np.square(weight.max(axis=0), dtype=np.float64), len(rows_of))
+        light = weight * shares[of].astype(np.float32)
+        return ArrivedLight(_summed(starts, column, light, shape), squares.astype(np.float32))
 
     def gather_surfaces(self, ids: Ids, samples: list[mi.UInt32], seed: int) -> list[Sparse]:
         """What cosine-distributed rays from some points find after 1, 2, ... specular surfaces, by vertices (n, n_v).

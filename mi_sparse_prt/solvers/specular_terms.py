@@ -13,17 +13,24 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.device_arrays import on_device
-from mi_sparse_prt.core.random_keys import element_seeds, mix, random_stream
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import SPECULAR, SpecularLight, passed_light
-from mi_sparse_prt.solvers.specular_chains import CELLS, LANES, Cells, SpecularChains, kept_ends
+from mi_sparse_prt.solvers.specular import LEAST_SHARE, SPECULAR, SpecularLight, passed_light
+from mi_sparse_prt.solvers.specular_chains import (
+    CELLS,
+    LANES,
+    Cells,
+    SpecularChains,
+    Strata,
+    draw_strata,
+    kept_ends,
+)
 
 STRATA = 4  # per axis of a cell of a hemisphere that sends all light on, each with a ray
-LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
 
 Floats = NDArray[np.float32]
 Sparse: TypeAlias = scipy.sparse.csr_array
@@ -100,46 +107,34 @@ class _TermChains(SpecularChains):
 
         What rays find must not depend on those by which cells were chosen: two seeds.
         """
-        cells, strata, scale = self._worth_rays(ids, self.find_cells(ids, cells_seed), cells_seed)
-        self.traced += len(ids) * CELLS**2 + int((strata**2).sum())
-        starts = np.searchsorted(cells.rows, np.arange(len(ids) + 1))
-        rays = np.concatenate([[0], np.cumsum(strata**2)])[starts]  # before each point
+        strata = self._worth_rays(ids, self.find_cells(ids, cells_seed), cells_seed)
+        self.traced += len(ids) * CELLS**2 + int((strata.across**2).sum())
+        starts = np.searchsorted(strata.cells.rows, np.arange(len(ids) + 1))
+        rays = np.concatenate([[0], np.cumsum(strata.across**2)])[starts]  # before each point
         first = 0
         while first < len(ids):
             most = int(np.searchsorted(rays, rays[first] + LANES // 8, side="right")) - 1
             last = min(max(most, first + 1), len(ids))
-            part = slice(starts[first], starts[last])
-            if part.start < part.stop:
-                some = cells.take(part)._replace(rows=cells.rows[part] - first)
-                yield (
-                    last - first,
-                    list(self._found(ids[first:last], some, strata[part], scale[part], lobes, seed)),
-                )
+            some = strata.take(slice(starts[first], starts[last]))
+            if len(some.which):
+                some = some._replace(cells=some.cells._replace(rows=some.cells.rows - first))
+                yield last - first, list(self._found(ids[first:last], some, lobes, seed))
             else:
                 yield last - first, []
             first = last
 
-    def _worth_rays(self, ids: Ids, cells: Cells, seed: int) -> tuple[Cells, NDArray[np.int64], Floats]:
-        """Cells to send rays into, strata per axis of each, and what their light is to be multiplied by.
-
-        Rays are in proportion to the share of light that is sent on; where that is less than one ray, some cells stand
-        for others.
-        """
+    def _worth_rays(self, ids: Ids, cells: Cells, seed: int) -> Strata:
+        """Strata of cells, with rays in proportion to the share of light that is sent on."""
         wanted = STRATA**2 * np.clip(cells.shares, LEAST_SHARE, 1)
-        chance = np.minimum(wanted, 1)
-        keys = self._problem.points.keys[np.asarray(ids)[cells.rows]]
-        drawn = mix(mix(keys ^ np.uint64(seed)) ^ cells.numbers.astype(np.uint64)) * 2.0**-64
-        kept = np.flatnonzero(drawn < chance)
-        strata = np.clip(np.rint(np.sqrt(wanted)), 1, STRATA).astype(np.int64)
-        return cells.take(kept), strata[kept], (1 / chance[kept]).astype(np.float32)
+        return draw_strata(
+            cells, self._problem.points.keys[np.asarray(ids)], wanted.astype(np.float64), STRATA, seed
+        )
 
-    def _found(
-        self, ids: Ids, cells: Cells, strata: NDArray[np.int64], scale: Floats, lobes: Lobes, seed: int
-    ) -> Iterator[_Light]:
+    def _found(self, ids: Ids, strata: Strata, lobes: Lobes, seed: int) -> Iterator[_Light]:
         """Light of rays into cells of some points, after one specular surface, after two, ..."""
-        ray, entry, rng = self._rays_into(ids, cells, strata, seed)
+        ray, entry, rng = self._rays_into(ids, strata.cells, strata.across, seed)
         of = entry.numpy()
-        of_lane, share = cells.rows[of], scale[of] / np.float32(CELLS * strata[of]) ** 2
+        of_lane, share = strata.cells.rows[of], strata.shares[of].astype(np.float32)
         into = _weights(lobes, on_device(mi.UInt32, np.asarray(ids)[of_lane].astype(np.uint32)), ray.d)
         for depth, ends in enumerate(self._follow(ray, dr.arange(mi.UInt32, len(of)), rng, True)):
             lanes, texels, light = kept_ends(ends)

@@ -237,6 +237,27 @@ def test_noise_is_told():
     assert noises[1] < 0.5 * noises[0]
 
 
+def test_cells_that_stand_for_others():
+    """Expected: with a ray in every fourth cell, light is right on average, and as far off as is told."""
+    scene = build(0.35, **objects(0.6))
+    problem = replace(problem_at(scene, prt.CubemapLighting(4), basis="texel"), specular_apart=True)
+    lit = np.flatnonzero(scene.albedo.any(axis=1))
+    ids, power = np.arange(len(lit)), problem.reflection.albedo[lit, None]
+    exact = specular_light(problem, 9, SpecularOptions(5, 5), lit).operator.rows(ids) * power
+    sums, errors, told = [], [], []
+    for seed in range(12):
+        found = specular_light(problem, seed, SpecularOptions(0.5, 0.5), lit)
+        rows = found.operator.rows(ids) * power
+        sums.append(rows.sum() / exact.sum())
+        errors.append(np.linalg.norm(rows - exact) / np.linalg.norm(exact))
+        told.append(found.noise)
+    mean, spread = np.mean(sums), np.std(sums, ddof=1) / np.sqrt(12)
+    print(f"{mean:.4f} +- {spread:.4f}; told {np.mean(told):.3f}, true {np.mean(errors):.3f}")
+    assert spread < 0.005
+    assert mean == pytest.approx(1, abs=4 * spread + 0.002)  # the exact ones' own error
+    assert np.mean(told) == pytest.approx(np.mean(errors), rel=0.2)
+
+
 def test_noise_of_its_own():
     """
     Expected: asked for a noise of its own, or one beside all light, a search stops at the first that it reaches; light

@@ -13,7 +13,7 @@ from mi_sparse_prt.core.bits import unpack
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.brute_force import exact_direct
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.specular_chains import Cells, SpecularChains, specular_form_factors
+from mi_sparse_prt.solvers.specular_chains import Cells, SpecularChains, draw_strata, specular_form_factors
 
 TEXTURED = {
     "type": "diffuse",
@@ -248,7 +248,8 @@ def test_chains_in_one_kernel_are_those_surface_by_surface(max_depth: int) -> No
     chains, ids = SpecularChains(problem), np.arange(scene.n_vertices)
     cells = chains.find_cells(ids, 1)
     strata = np.full(len(cells.rows), 2)
-    light = chains.gather_light(ids, cells, strata, 2).light
+    every = draw_strata(cells, problem.points.keys, 4.0 * np.ones(len(strata)), 2, 1)
+    light = chains.gather_light(ids, every, 2).light
     depths = max(problem.depths_apart, 1)
     known = np.zeros((3, scene.n_vertices, depths, 96))
     for depth, ends in enumerate(chains._follow(*chains._rays_into(ids, cells, strata, 2), True)):
@@ -278,4 +279,5 @@ def test_points_that_see_no_specular_surface() -> None:
     cells = Cells(np.zeros(4, np.int64), np.arange(4), np.ones(4, np.float32))
     chains = SpecularChains(problem)
     assert len(chains.find_cells(ids, 1).rows) == 0
-    assert chains.gather_light(ids[:1], cells, np.ones(4, np.int64), 2).light[0].nnz == 0
+    strata = draw_strata(cells, problem.points.keys, np.ones(4), 1, 1)
+    assert chains.gather_light(ids[:1], strata, 2).light[0].nnz == 0
