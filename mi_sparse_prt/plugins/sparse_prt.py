@@ -179,9 +179,9 @@ class SparsePRT(mi.SamplingIntegrator):
             copies = any(shape.class_name() == "Instance" for shape in scene.shapes())
             lit = surfaces.mitsuba if copies else scene
             return LampLitIntegrator(relit, lit, depth, self._hide_emitters, copies)
-        return RelitIntegrator(relit[0], self._hide_emitters)
+        return RelitIntegrator(relit, self._hide_emitters)
 
-    def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> list[RelitScene]:
+    def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> RelitScene:
         """All light but that which lamps send to the camera directly or after one reflection."""
         irradiance = np.zeros((1, surfaces.n_vertices, 3), np.float32)
         depth = self._settings["max_depth"]
@@ -189,16 +189,16 @@ class SparsePRT(mi.SamplingIntegrator):
             irradiance = self._light_of_lamps(surfaces)
         followed = surfaces_to_follow(surfaces) if self._settings["terms"] else []
         if environment is None:
-            return [RelitScene(surfaces, irradiance, None, None, depth, followed)]
+            return RelitScene(surfaces, irradiance, None, None, depth, followed)
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         sharp = sharp_light(environment)
         if not transport.terms:
             found = transport.irradiance_by_depth(environment)
             found = found if sharp is None else sharp.taken_from(found, transport)
             emitter = None if sharp is None else sharp.emitter
-            return [RelitScene(surfaces, irradiance + found, environment, None, depth, followed, emitter)]
-        relit: list[RelitScene] = [GlossyRelitScene(surfaces, transport, environment, environment, sharp)]
-        return [*relit, RelitScene(surfaces, irradiance, None, None, depth, followed)] if lamps else relit
+            return RelitScene(surfaces, irradiance + found, environment, None, depth, followed, emitter)
+        others = irradiance if lamps else None
+        return GlossyRelitScene(surfaces, transport, environment, environment, sharp, others)
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (k, n_v, 3) of light of lamps that met some, and at most 0, 1, ... surfaces; k may be 1."""

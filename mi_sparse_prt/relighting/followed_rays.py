@@ -36,12 +36,15 @@ class Way(NamedTuple):
         With which its direction was chosen, per solid angle; 0 if it could be no other.
     met : Mask
         It met more than surfaces that it passed straight on.
+    told : Mask
+        It went on from a surface of which rows tell a part of the light that it finds (``Seen.partly``).
     """
 
     depth: Any
     last: Any
     density: Any
     met: Any
+    told: Any
 
 
 class Seen(NamedTuple):
@@ -54,11 +57,14 @@ class Seen(NamedTuple):
     si : SurfaceInteraction3f
     whole : Mask
         All that the surface scatters is followed, not only single directions.
+    partly : Mask
+        So it is, for the sake of a part of the light; rows tell what it scatters of all other.
     """
 
     radiance: Any
     si: Any
     whole: Any
+    partly: Any
 
 
 def surfaces_to_follow(scene: Scene, reflection: Reflection | None = None) -> list[mi.BSDF]:
@@ -98,16 +104,19 @@ def follow(
     """
     ray, active = mi.Ray3f(ray), mi.Mask(active)
     total, throughput, density = mi.Color3f(0), mi.Color3f(1), mi.Float(0)
-    depth, valid = mi.UInt32(before), mi.Mask(False)
+    depth, valid, told = mi.UInt32(before), mi.Mask(False), mi.Mask(False)
     limit = dr.opaque(mi.UInt32, max_depth if 0 <= max_depth < LONGEST else LONGEST)
     active &= depth < limit
     while active:
-        radiance, si, whole = seen(ray, Way(depth, depth + 1 >= limit, density, valid), sampler, active)
+        way = Way(depth, depth + 1 >= limit, density, valid, told)
+        radiance, si, whole, partly = seen(ray, way, sampler, active)
         total += dr.select(active, throughput * radiance, 0)
         active &= si.is_valid()
-        sample, weight = _scattered(si, whole, sampler, active)
+        sample, weight = _scattered(si, whole | partly, sampler, active)
         valid |= active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-        density = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, sample.pdf)
+        single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        told |= active & partly & ~single
+        density = dr.select(single, 0, sample.pdf)
         # roulette: faint light is worth few rays; that it is denser in glass (eta) does not matter
         denser = dr.select(sample.eta > 0, dr.square(sample.eta), 1)
         goes_on = dr.sqrt(dr.minimum(dr.max(weight) * denser, 1))

@@ -90,6 +90,8 @@ class RelitScene:
         self._scene, self._background, self._lamps = scene.world, background, lamps
         self._brightness = None if lamps is None else mi.Color3f(np.ascontiguousarray(lamps[1].T))
         self.max_depth, self.followed = max_depth, followed
+        #: Of surfaces that rays go on from for light of lamps alone.
+        self.followed_for_lamps: Sequence[mi.BSDF] = ()
         self.goes_on, self.rough_glass = scene.specular or bool(followed), scene.rough_glass
         self._light = [_of_depths(irradiance)]  # irradiance / pi; coefficients of terms follow
         self._deepest, self._n_vertices = len(irradiance) - 1, scene.n_vertices
@@ -110,7 +112,8 @@ class RelitScene:
         if self.goes_on:
             value, valid = follow(partial(self._seen, shown), ray, sampler, active, self.max_depth)
         else:
-            found = self._met(ray, mi.Point2f(0.5), mi.UInt32(0), sampler, active, active)
+            way = Way(mi.UInt32(0), mi.Mask(False), mi.Float(0), mi.Mask(False), mi.Mask(False))
+            found = self._met(ray, mi.Point2f(0.5), way, sampler, active, active)
             value, valid = found.radiance, active & found.si.is_valid()
             if shown is not None:
                 value = dr.select(active & ~valid, shown.eval(found.si, active), value)
@@ -121,24 +124,24 @@ class RelitScene:
     ) -> Seen:
         """See ``follow``; what is ``shown`` is the background of rays that come straight from a camera."""
         u = mi.Point2f(sampler.next_1d(active), sampler.next_1d(active))
-        value, si, whole = self._met(ray, u, way.depth, sampler, active, active & ~way.last)
+        value, si, whole, partly = self._met(ray, u, way, sampler, active, active & ~way.last)
         if self._background is not None:
-            leaves = active & ~si.is_valid()
+            leaves = active & ~si.is_valid() & ~way.told
             leaves &= way.met if shown is None else True
             value += background_light(self._background, ray, way, leaves)
             if self.followed:
-                reflects = active & ~way.last & whole
+                reflects = active & ~way.last & whole & ~way.told
                 value += reflected_background(self._background, self._scene, si, sampler, reflects)
         if self._lamps is not None and self.followed:
             reflects = active & ~way.last & whole & si.is_valid()
             value += reflected_lamps(self._lamps[0], self._brightness, self._scene, si, sampler, reflects)
-        return Seen(value, si, whole)
+        return Seen(value, si, whole, partly)
 
     def _met(
         self,
         ray: mi.Ray3f,
         u: mi.Point2f,
-        depth: mi.UInt32,
+        way: Way,
         sampler: mi.Sampler,
         active: mi.Mask,
         reflects: mi.Mask,
@@ -146,19 +149,23 @@ class RelitScene:
         """What rays meet after some surfaces; their radiance where it is asked for and they are not followed."""
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         si = self._scene.interaction(hit, ray, active)
-        whole = is_one_of(self.followed, si)
-        valid = reflects & si.is_valid() & ~whole
+        whole, partly = is_one_of(self.followed, si), is_one_of(self.followed_for_lamps, si)
+        valid = reflects & si.is_valid() & ~whole & ~(partly & way.told)
         behind = valid & (mi.Frame3f.cos_theta(si.wi) < 0)
         corners, lit = self._hit_corners(hit, si, ray, valid, behind)
-        light = (self._deepest - dr.minimum(depth, self._deepest)) * self._n_vertices
-        value = dr.select(lit, self._shaded(si, corners, light, u, lit), 0)
+        light = (self._deepest - dr.minimum(way.depth, self._deepest)) * self._n_vertices
+        value = dr.select(lit, self._shaded(si, corners, self._part(light, partly, way), u, lit), 0)
         if self._sharp is not None:
-            value += reflected_light(self._sharp, self._arrives, si, sampler, mi.Mask(lit))
+            value += reflected_light(self._sharp, self._arrives, si, sampler, lit & ~way.told)
         if self._lamps is not None:
             emitters, brightness = self._lamps
             lamp, radiance = emitters.element_of(si, ray, active)
             value += radiance * dr.gather(mi.Color3f, self._brightness, mi.UInt32(lamp), lamp >= 0)
-        return Seen(value, si, whole)
+        return Seen(value, si, whole, partly)
+
+    def _part(self, light: mi.UInt32, partly: mi.Mask, way: Way) -> mi.UInt32:
+        """Where light of a depth begins, of the part of all light that surfaces show; there is but one."""
+        return light
 
     def _arrives(self, ray: mi.Ray3f, active: mi.Mask) -> mi.Mask:
         """Which rays leave the scene, through nothing but holes: light through panes is no part of direct light."""
@@ -263,6 +270,11 @@ def interpolated(values: mi.Color3f, corners: list[Corner], valid: mi.Mask) -> m
     return sum((w * dr.gather(mi.Color3f, values, i, valid) for i, w in corners), mi.Color3f(0))
 
 
+def _every_depth(values: NDArray[np.float32], depths: int) -> NDArray[np.float32]:
+    """Light (k, ...) of so many depths, all of it at each if it is not told apart."""
+    return np.broadcast_to(values, (depths, *values.shape[1:]))
+
+
 def _of_depths(values: NDArray[np.float32]) -> mi.Color3f:
     """Colours (k, n_v, 3) of vertices on the device, those of each depth after the other."""
     return mi.Color3f(np.ascontiguousarray(values.reshape(-1, 3).T))
@@ -283,6 +295,8 @@ class GlossyRelitScene(RelitScene):
     background : mi.Emitter or None
     sharp : SharpLight, optional
         Part of the environment that is found at the pixel.
+    lamps : (k, n_v, 3) float32, optional
+        Irradiance / pi of other light, as of ``RelitScene``; rays go on from all glossy surfaces to find it.
 
     Raises
     ------
@@ -297,6 +311,7 @@ class GlossyRelitScene(RelitScene):
         environment: Any,
         background: mi.Emitter | None,
         sharp: SharpLight | None = None,
+        lamps: NDArray[np.float32] | None = None,
     ) -> None:
         transport = transport.for_scene(scene)
         found, surfaces = transport.coefficients_by_depth(environment), transport.reflection
@@ -305,12 +320,21 @@ class GlossyRelitScene(RelitScene):
             found, emitter = sharp.taken_from_terms(found, transport), sharp.emitter
         assert isinstance(surfaces, InOutFactors)
         followed = surfaces_to_follow(scene, surfaces)
-        irradiance = np.stack([some.unit_albedo for some in found])
-        super().__init__(scene, irradiance, background, None, transport.max_depth, followed, emitter)
+        depths = len(found) if lamps is None else max(len(found), len(lamps))
+        sky = _every_depth(np.stack([some.unit_albedo for some in found]), depths)
+        super().__init__(scene, sky, background, None, transport.max_depth, followed, emitter)
+        if lamps is not None:
+            every = surfaces_to_follow(scene)
+            self.followed_for_lamps = [bsdf for bsdf in every if not any(bsdf is other for other in followed)]
+            self.goes_on |= bool(every)
+            others = _every_depth(lamps, depths)
+            self._light = [_of_depths(np.concatenate([sky, sky + others, others]))]
         self._diffuse = mi.Color3f(np.ascontiguousarray(surfaces.albedo.T))
         self._light += [
-            _of_depths(np.stack([some.terms[:, k] for some in found])) for k in range(transport.terms)
+            _of_depths(_every_depth(np.stack([some.terms[:, k] for some in found]), depths))
+            for k in range(transport.terms)
         ]
+        self._lit_by_lamps = lamps is not None
         self._tangents = mi.Vector3f(np.ascontiguousarray(surfaces.tangents.T))
         self._material = mi.UInt32(np.maximum(surfaces.material, 0).astype(np.uint32))
         self._glossy = mi.Bool(surfaces.material >= 0)
@@ -325,6 +349,13 @@ class GlossyRelitScene(RelitScene):
             if factors.varying_diffuse
         }
         self._tables = [mi.Float(np.ascontiguousarray(tables[..., c]).ravel()) for c in range(3)]
+
+    def _part(self, light: mi.UInt32, partly: mi.Mask, way: Way) -> mi.UInt32:
+        """Of the sky where rays go on for lamps; of all else where none did before, and of lamps after that."""
+        if not self._lit_by_lamps:
+            return light
+        size = (self._deepest + 1) * self._n_vertices
+        return light + dr.select(partly, 0, dr.select(way.told, 2 * size, size))
 
     def _reflectance(
         self, si: mi.SurfaceInteraction3f, corners: list[Corner], u: mi.Point2f, valid: mi.Mask

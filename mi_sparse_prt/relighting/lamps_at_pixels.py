@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
 
@@ -25,8 +23,8 @@ class LampLitIntegrator(RelitIntegrator):
 
     Parameters
     ----------
-    relit : sequence of RelitScene
-        All other light, that of lamps last; what they show is added up.
+    relit : RelitScene
+        All other light.
     scene : mi.Scene
         The shapes and the lamps, and maybe an environment, which is left out.
     max_depth : int
@@ -39,19 +37,18 @@ class LampLitIntegrator(RelitIntegrator):
 
     def __init__(
         self,
-        relit: Sequence[RelitScene],
+        relit: RelitScene,
         scene: mi.Scene,
         max_depth: int,
         hide_emitters: bool = False,
         triangles: bool = False,
     ) -> None:
-        super().__init__(relit[0], hide_emitters)
-        self._more = relit[1:]
+        super().__init__(relit, hide_emitters)
         self._scene = scene if scene.environment() is None else without_environment(scene)
         self._traced = TracedScene(self._scene) if triangles else self._scene
-        self._followed, self._max_depth = relit[-1].followed, max_depth
+        self._followed, self._max_depth = [*relit.followed, *relit.followed_for_lamps], max_depth
         self._goes_on = has_mirrors(scene) or bool(self._followed)
-        self._rough_glass = relit[-1].rough_glass
+        self._rough_glass = relit.rough_glass
         met = has_mirrors(scene) and any(shape.is_emitter() for shape in scene.shapes())
         self._caustics = met or bool(self._rough_glass)
         delta = mi.EmitterFlags.Delta
@@ -59,8 +56,6 @@ class LampLitIntegrator(RelitIntegrator):
 
     def _radiance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Mask) -> tuple[mi.Color3f, mi.Mask]:
         value, valid = super()._radiance(ray, sampler, active)
-        for relit in self._more:
-            value += relit.radiance(ray, sampler, active)[0]
         sampler.schedule_state()
         dr.eval(value, valid, ray)  # the next scene is another one, and a kernel on a GPU traces in one only
         if self._goes_on:
@@ -102,7 +97,7 @@ class LampLitIntegrator(RelitIntegrator):
         whole = is_one_of(self._followed, si)
         if self._caustics:
             direct += self._by_mirrors(si, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
-        return Seen(direct, si, whole)
+        return Seen(direct, si, whole, mi.Mask(False))
 
     def _by_mirrors(
         self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
@@ -123,12 +118,12 @@ class LampLitIntegrator(RelitIntegrator):
             radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
             rough = active & is_one_of(self._rough_glass, met)
             if not self._rough_glass or not self._unmet:
-                return Seen(radiance, met, rough)
+                return Seen(radiance, met, rough, mi.Mask(False))
             asked = rough & ~way.last
             there, light = self._scene.sample_emitter_direction(met, sampler.next_2d(asked), True, asked)
             asked &= there.delta
             value = met.bsdf().eval(mi.BSDFContext(), met, met.to_local(there.d), asked)
-            return Seen(radiance + dr.select(asked, value * light, 0), met, rough)
+            return Seen(radiance + dr.select(asked, value * light, 0), met, rough, mi.Mask(False))
 
         ray = si.spawn_ray(si.to_world(sample.wo))
         found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth, depth)
