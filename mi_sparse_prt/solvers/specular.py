@@ -38,7 +38,8 @@ from mi_sparse_prt.solvers.specular_chains import (
 
 SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
-ROUNDS = 3  # after the first
+ROUNDS = 6  # after the first
+GROWTH = 4.0  # times all rays before, at most in one round: those that come after it are better placed
 ENOUGH = (
     1.25  # times the squared noise that is wanted, after a round: the noise itself is known about as well
 )
@@ -241,7 +242,7 @@ class _Mean:
             bound = limit.of(self.total.square)
             if self._sample is None or self.total.noise <= self._enough * bound:
                 break
-            wanted = 0.9 / (1 / max(bound, 1e-30) - 1 / self.total.noise)
+            wanted = 1 / (1 / max(bound, 1e-30) - 1 / self.total.noise)
             found, finest = self._sample(wanted)
             self.total, self._enough = _mean_of(self.total, found), ENOUGH
             if finest:
@@ -271,7 +272,9 @@ class _Arriving:
         first = self._sampled(options.first**2 * shares, most)
 
         def sample(wanted: float) -> tuple[_Estimate, bool]:
-            rays = np.minimum(self._moments.best_rays(wanted), float(most**2))
+            rays = self._moments.best_rays(wanted)
+            rays *= min(GROWTH * self._moments.traced / max(2 * rays.sum(), 1), 1)
+            rays = np.minimum(rays, float(most**2))
             return self._sampled(rays, most), bool((rays == most**2).all())
 
         return _Mean(first._replace(rays=found + first.rays), sample)
@@ -343,6 +346,11 @@ class _Moments:
         """What more rays found."""
         self._squares[strata.which] += squares
         self._traced[strata.which] += strata.across**2
+
+    @property
+    def traced(self) -> float:
+        """Rays so far."""
+        return float(self._traced.sum())
 
     def best_rays(self, noise: float) -> Doubles:
         """Rays (m,) into each cell, of each of two halves, whose mean has so much squared noise, about.
