@@ -169,7 +169,7 @@ class Execution:
         if not sources.specular_apart:
             return known
         # noise of single vertices does not matter: points see many, whose mean has little of it
-        few = SpecularOptions(last=4)
+        few = SpecularOptions(4, 4)
         return replace(known, specular=specular_light(sources, self._run.seed, few))
 
     def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:

@@ -9,6 +9,7 @@ from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN, MINIMUM_GAIN
+from mi_sparse_prt.reconstruction.specular_noise import SpecularNoise
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularLight, SpecularSearch
 from mi_sparse_prt.solvers.specular_terms import term_rows
@@ -34,7 +35,10 @@ class SpecularSteps:
     def __init__(self, problem: Problem, settings: Settings, seed: int) -> None:
         self._aim, self._target = settings.specular.error, settings.target_error
         self._own = settings.specular_error
-        self._search = SpecularSearch(problem, seed, settings.specular)
+        averaging = None
+        if problem.scene.bends_light and problem.at_vertices is problem:
+            averaging = SpecularNoise(problem, seed)
+        self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
         self._search.refine(AS_SOURCE * self._aim)
         self._terms = term_rows(problem, seed) if problem.reflection.terms else None
 

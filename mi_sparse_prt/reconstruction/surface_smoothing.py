@@ -11,7 +11,7 @@ for Adaptive Sampling and Reconstruction"). The neighbourhood is that for which 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -35,7 +35,10 @@ Floats = NDArray[np.float32]
 
 
 def smoothing_levels(
-    scene: Scene, points: Points, vertices: NDArray[np.int64] | None = None
+    scene: Scene,
+    points: Points,
+    vertices: NDArray[np.int64] | None = None,
+    strides: Sequence[int] = STRIDES,
 ) -> list[scipy.sparse.csr_array]:
     """Each vertex of a mesh takes the value at it of the linear function that fits its neighbours best.
 
@@ -46,6 +49,8 @@ def smoothing_levels(
         Of all vertices.
     vertices : (n,) integers, optional
         Those that are smoothed, among themselves, ascending; all if not given.
+    strides : sequence of int, optional
+        One of so many of them is looked at on each level.
 
     Returns
     -------
@@ -54,7 +59,7 @@ def smoothing_levels(
     """
     chosen, walls = np.arange(len(points)) if vertices is None else vertices, Walls(scene, points)
     levels = []
-    for stride in STRIDES:
+    for stride in strides:
         every: list[_Entries] = []
         for mesh in scene.meshes:
             ids = chosen[slice(*np.searchsorted(chosen, (mesh.vertices.start, mesh.vertices.stop)))]

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.ndimage
@@ -117,6 +117,16 @@ class SpecularLight:
         )
 
 
+class Averaging(Protocol):
+    """Averages out noise between neighbouring vertices (``reconstruction.specular_noise``)."""
+
+    def judge(self, halves: list[list[Sparse]], power: Doubles) -> float:
+        """What squared noise is left of two halves' mean."""
+
+    def averaged(self, light: Sparse) -> Sparse:
+        """Light (n, m) with as little."""
+
+
 class _Limit(NamedTuple):
     """What squared noise may be: a share of the squared norm of light, and a number; or a share of it alone."""
 
@@ -142,6 +152,7 @@ def specular_light(
     seed: int,
     options: SpecularOptions = SpecularOptions(),  # noqa: B008
     ids: Ids | None = None,
+    averaging: Averaging | None = None,
 ) -> SpecularLight:
     """Light from the sky, or of lamps, that arrives by way of mirrors and glass, at some points.
 
@@ -157,8 +168,10 @@ def specular_light(
     options : SpecularOptions
     ids : (n,) integers, optional
         Points; all if not given.
+    averaging : Averaging, optional
+        Of all points, if these are vertices: what mirrors and glass bring is smooth where they are far away.
     """
-    search = SpecularSearch(problem, seed, options, ids)
+    search = SpecularSearch(problem, seed, options, ids, averaging)
     search.refine(options.error)
     return search.light()
 
@@ -172,14 +185,21 @@ class SpecularSearch:
         As of ``SpecularLight``.
     """
 
-    def __init__(self, problem: Problem, seed: int, options: SpecularOptions, ids: Ids | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        seed: int,
+        options: SpecularOptions,
+        ids: Ids | None = None,
+        averaging: Averaging | None = None,
+    ) -> None:
         every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
         seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 128)]
         power = np.square(problem.reflection.albedo[every].astype(np.float64))
         self._direct, self._depths = _direct_norm(problem, every, power, seeds[-1]), problem.depths_apart
         self._parts, self.seen = [], None
         if problem.scene.bends_light:
-            self._parts.append(_Arriving(problem, every, power, seeds[:32]).estimated(options))
+            self._parts.append(_Arriving(problem, every, power, seeds[:32]).estimated(options, averaging))
         if problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting):
             passing = _Passing(problem, every, power, seeds[32:-1])
             self._parts.append(passing.estimated(options))
@@ -196,20 +216,20 @@ class SpecularSearch:
         return self._relative(sum(part.total.square for part in self._parts))
 
     def _relative(self, square: float) -> float:
-        return float(np.sqrt(sum(part.total.noise for part in self._parts) / max(square, 1e-300)))
+        return float(np.sqrt(sum(part.noise for part in self._parts) / max(square, 1e-300)))
 
     def refine(self, error: float, noise: float = 0.0) -> None:
         """Trace more rays until either is about so much: noise relative to all light, or to specular light alone."""
         for part in self._parts:
             square = sum(p.total.square for p in self._parts) + self._direct
-            others = sum(p.total.noise for p in self._parts if p is not part) / max(square, 1e-300)
+            others = sum(p.noise for p in self._parts if p is not part) / max(square, 1e-300)
             share = max(error**2 - others, error**2 / len(self._parts))
             part.refine(_Limit(share, share * self._direct, noise**2))
 
     def light(self) -> SpecularLight:
         """What was found so far."""
-        halves = [half for part in self._parts for half in part.total.halves]
-        mean = [sum(matrices[1:], matrices[0]) * np.float32(0.5) for matrices in zip(*halves, strict=True)]
+        means = [part.mean() for part in self._parts]
+        mean = [sum(matrices[1:], matrices[0]) for matrices in zip(*means, strict=True)]
         grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
         matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))
         rays = sum(part.total.rays for part in self._parts)
@@ -228,25 +248,59 @@ class _Mean:
     sample : callable, optional
         Another estimate, of as much squared noise as it is asked for, about, and whether it is as fine as can be; None
         if the first is.
+    power : (n, 3) float64, optional
+        What the squares of each row count.
+    averaging : Averaging, optional
+
+    Attributes
+    ----------
+    noise : float
+        Squared, that averaging leaves.
     """
 
     def __init__(
-        self, total: _Estimate, sample: Callable[[float], tuple[_Estimate, bool]] | None = None
+        self,
+        total: _Estimate,
+        sample: Callable[[float], tuple[_Estimate, bool]] | None = None,
+        power: Doubles | None = None,
+        averaging: Averaging | None = None,
     ) -> None:
-        self.total, self._sample = total, sample
-        self._enough = 1.0
+        self._sample, self._power, self._averaging, self._enough = sample, power, averaging, 1.0
+        self._take(total)
+
+    def _take(self, total: _Estimate) -> None:
+        self.total, self.noise = total, total.noise
+        if self._averaging is not None and self._power is not None and total.noise > 0:
+            halves = _distinct(total.halves)
+            power = self._power if len(halves[0]) > 1 else self._power.sum(axis=1, keepdims=True)
+            self.noise = min(max(self._averaging.judge(halves, power), 0), total.noise)
 
     def refine(self, limit: _Limit) -> None:
         """Add estimates until the noise is small enough."""
         for _ in range(ROUNDS):
-            bound = limit.of(self.total.square)
-            if self._sample is None or self.total.noise <= self._enough * bound:
+            bound, before = max(limit.of(self.total.square), 1e-30), self.total.noise
+            if self._sample is None or self.noise <= self._enough * bound:
                 break
-            wanted = 1 / (1 / max(bound, 1e-30) - 1 / self.total.noise)
-            found, finest = self._sample(wanted)
-            self.total, self._enough = _mean_of(self.total, found), ENOUGH
+            # its mean with what there is has as much as is wanted, of which the same share is left
+            found, finest = self._sample(before * bound / (self.noise - bound))
+            self._take(_mean_of(self.total, found))
+            self._enough = ENOUGH
             if finest:
                 self._sample = None
+
+    def mean(self) -> list[Sparse]:
+        """Light of all channels, of both halves together."""
+        first, second = _distinct(self.total.halves)
+        mean = [(a + b) * np.float32(0.5) for a, b in zip(first, second, strict=True)]
+        if self._averaging is not None and self.total.noise > 0:
+            mean = [self._averaging.averaged(light) for light in mean]
+        return mean * (len(self.total.halves[0]) // len(mean))
+
+
+def _distinct(halves: list[list[Sparse]]) -> list[list[Sparse]]:
+    """Of channels that are all the same, one."""
+    same = all((half[0] != other).nnz == 0 for half in halves for other in half[1:])
+    return [half[:1] for half in halves] if same else halves
 
 
 class _Arriving:
@@ -259,7 +313,7 @@ class _Arriving:
         self._cells = self._chains.find_cells(ids, next(self._seeds))
         self._moments = _Moments(self._cells, power.max(axis=1))
 
-    def estimated(self, options: SpecularOptions) -> _Mean:
+    def estimated(self, options: SpecularOptions, averaging: Averaging | None = None) -> _Mean:
         """As many rays as the noise asks for; those before say where light comes from.
 
         First, rays are in proportion to the share of light that surfaces send on.
@@ -267,7 +321,7 @@ class _Arriving:
         found, most = len(self._ids) * CELLS**2, max(int(options.last), 1)
         if options.first >= options.last:
             only = self._sampled(np.full(len(self._cells.rows), float(options.first**2)), most)
-            return _Mean(only._replace(rays=found + only.rays))
+            return _Mean(only._replace(rays=found + only.rays), None, self._power, averaging)
         shares = np.clip(self._cells.shares.astype(np.float64), LEAST_SHARE, 1)
         first = self._sampled(options.first**2 * shares, most)
 
@@ -277,7 +331,7 @@ class _Arriving:
             rays = np.minimum(rays, float(most**2))
             return self._sampled(rays, most), bool((rays == most**2).all())
 
-        return _Mean(first._replace(rays=found + first.rays), sample)
+        return _Mean(first._replace(rays=found + first.rays), sample, self._power, averaging)
 
     def _sampled(self, rays: Doubles, most: int) -> _Estimate:
         """Light from so many rays into each cell, about, twice."""
