@@ -40,9 +40,7 @@ SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
 ROUNDS = 6  # after the first
 GROWTH = 4.0  # times all rays before, at most in one round: those that come after it are better placed
-ENOUGH = (
-    1.25  # times the squared noise that is wanted, after a round: the noise itself is known about as well
-)
+ENOUGH = 1.1  # times the squared noise that is wanted, after a round: it is known about as well
 LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel, of light that passes straight
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
