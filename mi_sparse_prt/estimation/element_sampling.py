@@ -65,7 +65,7 @@ class Effort:
     fewest_paths: int = 64
     spp: int = 512
     strata: int = 4
-    specular: int = 256
+    specular: int = 64
     specular_strata: int = 8
 
     def rays_of(self, total: int, n_meshes: int) -> float:

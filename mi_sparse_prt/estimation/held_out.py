@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,7 +28,8 @@ from mi_sparse_prt.estimation.element_sampling import (
     for_direct_light,
     for_indirect_light,
 )
-from mi_sparse_prt.operators.operator import Operator
+from mi_sparse_prt.operators.operator import Ids, Operator
+from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import FEW_MESHES
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -258,16 +260,8 @@ class _Estimator:
 
     def _specular(self, rng: np.random.Generator, part: float) -> Samples:
         """Light by way of mirrors and glass: whole rows, against two independent estimates of these."""
-        sizes = [mesh.vertices.stop - mesh.vertices.start for mesh in self._transport.meshes]
-        counts = [
-            min(size, max(1, round(part * self._effort.specular * size / sum(sizes)))) for size in sizes
-        ]
-        ids = np.concatenate(
-            [
-                mesh.vertices.start + np.sort(rng.choice(size, count, replace=False))
-                for mesh, size, count in zip(self._transport.meshes, sizes, counts, strict=True)
-            ]
-        )
+        draws = [self._specular_rows(mesh.vertices, part, rng) for mesh in self._transport.meshes]
+        ids, weights = (np.concatenate(drawn) for drawn in zip(*draws, strict=True))
         once = SpecularOptions(self._effort.specular_strata, self._effort.specular_strata)
         ours = self._transport.operators["specular"].rows(ids).astype(np.float64)
         seeds = rng.integers(1 << 32, size=2)
@@ -276,14 +270,38 @@ class _Estimator:
         )
         power = np.square(self._problem.reflection.albedo[ids].astype(np.float64))
         sums = [np.broadcast_to((a * b).sum(axis=1), power.shape) for a, b in ((ours - x, ours - y), (x, y))]
-        weights = np.repeat(np.divide(sizes, counts), counts)
         columns = [np.stack([(power * s).sum(axis=1), s.sum(axis=1)], axis=1) for s in sums]
-        ends = np.cumsum(counts)[:-1]
+        ends = np.cumsum([len(rows) for rows, _ in draws])[:-1]
         parts = zip(*(np.split(array, ends) for array in (weights, *columns)), strict=True)
         return {
             (mesh.name, "specular"): Sample(*one)
             for mesh, one in zip(self._transport.meshes, parts, strict=True)
         }
+
+    def _specular_rows(self, mesh: slice, part: float, rng: np.random.Generator) -> tuple[Ids, Doubles]:
+        """Some rows of a mesh, and how many each stands for; half of them where much light is, the others anywhere."""
+        own, size = self._specular_energy[mesh], mesh.stop - mesh.start
+        even, bright = size / len(self._specular_energy), own.sum() / max(self._specular_energy.sum(), 1e-300)
+        count = max(1, round(part * self._effort.specular * (even + bright) / 2))
+        if count >= size:
+            return np.arange(mesh.start, mesh.stop), np.ones(size)
+        lit = own / own.sum() if own.any() else np.full(size, 1 / size)
+        chance = (1 / size + lit) / 2
+        chosen = np.sort(rng.choice(size, count, p=chance / chance.sum()))
+        return mesh.start + chosen, 1 / (count * chance[chosen])
+
+    @cached_property
+    def _specular_energy(self) -> Doubles:
+        """Of the light by way of mirrors and glass, as this matrix has it, that each vertex sends on (n,)."""
+        operator, albedo = self._transport.operators["specular"], self._problem.reflection.albedo
+        total = np.zeros(len(albedo))
+        for some in operator.by_depth or (operator,):
+            assert isinstance(some, SparseRows)
+            for channel in range(3):
+                matrix = some.channel(channel).matrices[0][: len(albedo)]
+                squares = np.asarray(matrix.power(2).sum(axis=1), np.float64).ravel()
+                total += squares * albedo[:, channel].astype(np.float64) ** 2
+        return total
 
     def _batches(self, chosen: dict[tuple[str, str], Chosen]) -> Iterator[list[tuple[str, str]]]:
         """Those to evaluate together: of one part, with as many rows per point, and not too many."""
