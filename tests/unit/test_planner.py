@@ -686,7 +686,7 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
         assert found.parts["specular"] == pytest.approx(0.9 * aim)
         assert found.total == pytest.approx(math.hypot(others, 0.9 * aim))
         steps.refine(found)
-        assert asked == pytest.approx([4 * aim, least], rel=0.01)
+        assert asked == pytest.approx([2 * aim, least], rel=0.01)
 
 
 def test_noise_of_specular_light_alone(monkeypatch):
@@ -718,7 +718,7 @@ def test_noise_of_specular_light_alone(monkeypatch):
     )
     assert steps.foreseen(found).total == pytest.approx(0.03)
     steps.refine(found)
-    assert asked[0] == (pytest.approx(4 * 0.02 / math.sqrt(2)), 0)
+    assert asked[0] == (pytest.approx(2 * 0.02 / math.sqrt(2)), 0)
     assert asked[1] == (pytest.approx(0.03 * math.sqrt(1 / 0.81 - 1), rel=0.01), 0.1)
     assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
     with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
