@@ -365,11 +365,10 @@ class FiniteElements:
         energies = [self._energies(x[depth]) * size for x, size in zip(light, sizes, strict=True)]
         for c, (x, rho, kept) in enumerate(zip(light, albedo, all_but_least(energies, least), strict=True)):
             matrix, after = of_channel(self._matrices, c)[met], x[depth + 1 + met]
-            if kept.all():
-                add_scaled(matrix, rho[None], self.nodes.interpolate(x[depth]), after[None], 0)
-            elif kept.any():
-                some = self.nodes.interpolate(np.ascontiguousarray(x[depth][:, kept]))
-                after[:, kept] += multiply_scaled(matrix, rho[None], some)[0]
+            # the longest come first: all up to the last one that is kept, which is faster than to pick some
+            if width := int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 0:
+                some = self.nodes.interpolate(np.ascontiguousarray(x[depth][:, :width]))
+                add_scaled(matrix, rho[None], some, after[None], 0)
 
     def _terms(
         self, light: list[list[Floats]], sizes: list[Doubles], right: Sequence[Floats], least: float
