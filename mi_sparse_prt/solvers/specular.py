@@ -39,6 +39,9 @@ from mi_sparse_prt.solvers.specular_chains import (
 SAMPLE = 512  # points that tell how much direct light there is
 SPECULAR = 7  # spawn key
 ROUNDS = 6  # after the first
+FEWEST = (
+    1 << 18
+)  # rays at first, if that is no more than one of each cell: of very few, all may miss the light
 GROWTH = 4.0  # times all rays before, at most in one round: those that come after it are better placed
 ENOUGH = 1.1  # times the squared noise that is wanted, after a round: it is known about as well
 LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
@@ -321,7 +324,8 @@ class _Arriving:
             only = self._sampled(np.full(len(self._cells.rows), float(options.first**2)), most)
             return _Mean(only._replace(rays=found + only.rays), None, self._power, averaging)
         shares = np.clip(self._cells.shares.astype(np.float64), LEAST_SHARE, 1)
-        first = self._sampled(options.first**2 * shares, most)
+        each = np.clip(FEWEST / max(len(shares), 1), options.first**2, max(options.first, 1) ** 2)
+        first = self._sampled(each * shares, most)
 
         def sample(wanted: float) -> tuple[_Estimate, bool]:
             rays = self._moments.best_rays(wanted)
@@ -388,9 +392,8 @@ class _Moments:
     def __init__(self, cells: Cells, power: Doubles) -> None:
         lit, rows = np.unique(cells.rows, return_inverse=True)
         self._lit, self._place = len(lit), rows * CELLS**2 + cells.numbers
-        self._power = np.maximum(power, LEAST_SHARE * power.max(initial=0))[
-            cells.rows
-        ]  # black vertices have rays, too
+        least = LEAST_SHARE * power.max(initial=0)  # black vertices have rays, too
+        self._power = np.maximum(power, least)[cells.rows]
         self._squares, self._traced = np.zeros(len(rows)), np.zeros(len(rows))
         self.noise, self.rays = 0.0, np.ones(len(rows))
 
