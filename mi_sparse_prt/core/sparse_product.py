@@ -44,7 +44,7 @@ def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Float
 def add_scaled(
     matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int
 ) -> None:
-    """Add what ``multiply_scaled`` returns to n rows of a result (channels, ..., k), from ``row`` on."""
+    """Add what ``multiply_scaled`` returns to n rows of a result (channels, ..., at least k), from ``row`` on."""
     _multiply_into(matrix, albedo, light, result, row, True)
 
 
@@ -52,7 +52,7 @@ def _multiply_into(
     matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int, add: bool
 ) -> None:
     if light.shape[1] < 8:  # columns that are not worth a second thread
-        part = result[:, row : row + matrix.shape[0]]
+        part = result[:, row : row + matrix.shape[0], : light.shape[1]]
         found = np.stack([matrix @ (rho[:, None] * light) for rho in albedo])
         part[:] = part + found if add else found
         return

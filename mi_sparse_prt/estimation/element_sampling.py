@@ -65,8 +65,8 @@ class Effort:
     fewest_paths: int = 64
     spp: int = 512
     strata: int = 4
-    specular: int = 64
-    specular_strata: int = 8
+    specular: int = 128
+    specular_strata: int = 4
 
     def rays_of(self, total: int, n_meshes: int) -> float:
         """How many elements of a mesh, one of ``n_meshes``, are drawn for direct light that is bits, about."""

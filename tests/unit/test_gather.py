@@ -198,11 +198,12 @@ def test_several_albedos_share_a_light(monkeypatch):
         light = rng.normal(size=(70, width)).astype(np.float32)
         known = np.stack([matrix.toarray() @ (rho[:, None] * light) for rho in albedo])
         assert np.abs(multiply_scaled(matrix, albedo, light) - known).max() < 1e-5
-        sums = np.ones((3, 100, width), np.float32)
+        sums = np.ones((3, 100, width + 5), np.float32)  # more columns than the light has
         add_scaled(matrix, albedo, light, sums, 7)
-        assert np.abs(sums[:, 7:97] - 1 - known).max() < 1e-5
+        assert np.abs(sums[:, 7:97, :width] - 1 - known).max() < 1e-5
         assert (sums[:, :7] == 1).all()
         assert (sums[:, 97:] == 1).all()
+        assert (sums[..., width:] == 1).all()
 
 
 def test_apply_is_the_neumann_series(coloured_scene, monkeypatch):
