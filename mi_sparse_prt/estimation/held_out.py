@@ -294,13 +294,15 @@ class _Estimator:
     def _specular_energy(self) -> Doubles:
         """Of the light by way of mirrors and glass, as this matrix has it, that each vertex sends on (n,)."""
         operator, albedo = self._transport.operators["specular"], self._problem.reflection.albedo
-        total = np.zeros(len(albedo))
+        power, total = np.square(albedo.astype(np.float64)), np.zeros(len(albedo))
         for some in operator.by_depth or (operator,):
             assert isinstance(some, SparseRows)
-            for channel in range(3):
-                matrix = some.channel(channel).matrices[0][: len(albedo)]
-                squares = np.asarray(matrix.power(2).sum(axis=1), np.float64).ravel()
-                total += squares * albedo[:, channel].astype(np.float64) ** 2
+            alike = 1 if len(some.matrices) == 3 else 3  # channels of a matrix
+            for channel, matrix in enumerate(some.matrices):
+                end = matrix.indptr[len(albedo)]
+                rows = np.repeat(np.arange(len(albedo)), np.diff(matrix.indptr[: len(albedo) + 1]))
+                squares = np.bincount(rows, np.square(matrix.data[:end], dtype=np.float64), len(albedo))
+                total += squares * power[:, channel : channel + alike].sum(axis=1)
         return total
 
     def _batches(self, chosen: dict[tuple[str, str], Chosen]) -> Iterator[list[tuple[str, str]]]:
