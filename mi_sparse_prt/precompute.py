@@ -38,7 +38,8 @@ from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflecti
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import ENOUGH, SpecularLight
+from mi_sparse_prt.solvers.refined_mean import ENOUGH
+from mi_sparse_prt.solvers.specular import SpecularLight
 from mi_sparse_prt.transport import LightTransport
 
 FACTOR_SHARE = 0.5  # of the target error, which the factors of BRDFs may have; a quarter of its square

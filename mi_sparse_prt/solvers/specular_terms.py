@@ -16,10 +16,12 @@ from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.solvers.bent_light import LEAST_SHARE
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
+from mi_sparse_prt.solvers.passed_light import passed_light
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.specular import LEAST_SHARE, SPECULAR, SpecularLight, passed_light
+from mi_sparse_prt.solvers.specular import SPECULAR, SpecularLight
 from mi_sparse_prt.solvers.specular_chains import (
     CELLS,
     LANES,

@@ -1,0 +1,174 @@
+"""Light that arrives around corners, by mirrors and glass: rays into the cells of hemispheres where it comes from."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.refined_mean import Averaging, Doubles, Estimate, RefinedMean, Round, compared
+from mi_sparse_prt.solvers.specular_chains import (
+    CELLS,
+    LANES,
+    Cells,
+    Sparse,
+    SpecularChains,
+    Strata,
+    draw_strata,
+)
+
+FEWEST = (
+    1 << 18
+)  # rays at first, if that is no more than one of each cell: of very few, all may miss the light
+GROWTH = 4.0  # times all rays before, at most in one round: those that come after it are better placed
+SHRINKING = 1 / 8  # of them, at least: fewer tell too little, also of their own noise
+LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
+
+Floats = NDArray[np.float32]
+
+
+class BentLight:
+    """Light that arrives around corners: by mirrors and glass."""
+
+    def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
+        self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
+        self._size = problem.emission.size * max(problem.depths_apart, 1)
+        self._keys = problem.points.keys[np.asarray(ids)]
+        self._cells = self._chains.find_cells(ids, next(self._seeds))
+        self._moments = _Moments(self._cells, power.max(axis=1))
+
+    def estimated(self, first: float, last: float, averaging: Averaging | None = None) -> RefinedMean:
+        """As many rays as the noise asks for; those before say where light comes from.
+
+        First, rays are in proportion to the share of light that surfaces send on.
+
+        Parameters
+        ----------
+        first, last : float
+            Strata per axis of a cell, see ``SpecularOptions``.
+        averaging : Averaging, optional
+        """
+        found, most = len(self._ids) * CELLS**2, max(int(last), 1)
+        if first >= last:
+            only = self._sampled(np.full(len(self._cells.rows), float(first**2)), most)
+            return RefinedMean(only._replace(rays=found + only.rays), None, self._power, averaging)
+        shares = np.clip(self._cells.shares.astype(np.float64), LEAST_SHARE, 1)
+        each = np.clip(FEWEST / max(len(shares), 1), first**2, max(first, 1) ** 2)
+        begun = self._sampled(each * shares, most)
+
+        def sample(wanted: float) -> Round:
+            rays = self._moments.best_rays(wanted)
+            before, all_rays = self._moments.traced, max(2 * float(rays.sum()), 1e-30)
+            rays *= np.clip(1, SHRINKING * before / all_rays, GROWTH * before / all_rays)
+            rays = np.minimum(rays, float(most**2))
+            expected = self._moments.foreseen(rays)
+            return Round(self._sampled(rays, most), expected, bool((rays == most**2).all()))
+
+        return RefinedMean(begun._replace(rays=found + begun.rays), sample, self._power, averaging)
+
+    def _sampled(self, rays: Doubles, most: int) -> Estimate:
+        """Light from so many rays into each cell, about, twice."""
+        halves, traced = [], 0
+        for _ in "ab":
+            seed = next(self._seeds)
+            strata = draw_strata(self._cells, self._keys, rays, most, seed)
+            half, squares = self._light(strata, seed)
+            self._moments.add(strata, squares)
+            halves.append(half)
+            traced += int((strata.across**2).sum())
+        total = compared(halves, self._power, traced)
+        self._moments.calibrate(total.noise, rays)
+        return total
+
+    def _light(self, strata: Strata, seed: int) -> tuple[list[Sparse], NDArray[np.float32]]:
+        """Light (points, texels) of each channel, for some points at a time."""
+        none = scipy.sparse.csr_array((len(self._ids), self._size), dtype=np.float32)
+        lit, starts = np.unique(strata.cells.rows, return_index=True)  # rows are sorted
+        starts = np.append(starts, len(strata.which))
+        rays = np.concatenate([[0], np.cumsum(strata.across**2)])[starts]
+        found, squares, first = [], [np.zeros(0, np.float32)], 0
+        while first < len(lit):
+            most = int(np.searchsorted(rays, rays[first] + LANES, side="right")) - 1
+            last = min(max(most, first + 1), len(lit))
+            some = strata.take(slice(starts[first], starts[last]))
+            rows = np.searchsorted(lit[first:last], some.cells.rows)
+            some = some._replace(cells=some.cells._replace(rows=rows))
+            arrived = self._chains.gather_light(self._ids[lit[first:last]], some, seed)
+            found.append(arrived.light)
+            squares.append(arrived.squares)
+            first = last
+        channels = [scipy.sparse.vstack(blocks, format="csr") for blocks in zip(*found, strict=True)]
+        return [_spread(m, lit, none.shape) for m in channels] or [none] * 3, np.concatenate(squares)
+
+
+def _spread(matrix: Sparse, rows: Ids, shape: tuple[int, int]) -> Sparse:
+    """A matrix with more rows, of which some are those of another."""
+    counts = np.zeros(shape[0], np.int64)
+    counts[rows] = np.diff(matrix.indptr)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return scipy.sparse.csr_array((matrix.data, matrix.indices, starts), shape=shape)
+
+
+class _Moments:
+    """Squared weights of rays into cells, which tell where more of them are worth most.
+
+    Parameters
+    ----------
+    cells : Cells
+        (m,) of n points.
+    power : (n,) float64
+        What the squares of each row count.
+    """
+
+    def __init__(self, cells: Cells, power: Doubles) -> None:
+        lit, rows = np.unique(cells.rows, return_inverse=True)
+        self._lit, self._place = len(lit), rows * CELLS**2 + cells.numbers
+        least = LEAST_SHARE * power.max(initial=0)  # black vertices have rays, too
+        self._power = np.maximum(power, least)[cells.rows]
+        self._squares, self._traced = np.zeros(len(rows)), np.zeros(len(rows))
+        self._noise, self._rays = 0.0, np.ones(len(rows))  # of the last estimate
+
+    def add(self, strata: Strata, squares: Floats) -> None:
+        """What more rays found."""
+        self._squares[strata.which] += squares
+        self._traced[strata.which] += strata.across**2
+
+    @property
+    def traced(self) -> float:
+        """Rays so far."""
+        return float(self._traced.sum())
+
+    def calibrate(self, noise: float, rays: Doubles) -> None:
+        """What squared noise the mean of two halves had, of so many rays (m,) into each cell; none tells nothing."""
+        if noise > 0:
+            self._noise, self._rays = noise, rays
+
+    def best_rays(self, noise: float) -> Doubles:
+        """Rays (m,) into each cell, of each of two halves, whose mean has so much squared noise, about.
+
+        In proportion to the roots of moments: so is the sum of moments over numbers of rays least.
+        """
+        best = np.sqrt(self._second)
+        return best * (self.foreseen(best) / noise)
+
+    def foreseen(self, rays: Doubles) -> float:
+        """Squared noise of the mean of two halves of so many rays, about: the last estimate says what one ray has."""
+        second = self._second
+        known = float((second / np.maximum(self._rays, 1e-30)).sum())
+        return self._noise / max(known, 1e-300) * float((second / np.maximum(rays, 1e-30)).sum())
+
+    @property
+    def _second(self) -> Doubles:
+        """Moments (m,), those of neighbouring cells together, as if there were one average ray more."""
+        average = self._squares.sum() / max(self._traced.sum(), 1)
+        return (self._around(self._squares) + average) / (self._around(self._traced) + 1) * self._power
+
+    def _around(self, values: Doubles) -> Doubles:
+        """Sums over each cell and those beside it."""
+        grid = np.zeros(self._lit * CELLS**2, np.float32)
+        grid[self._place] = values
+        mean = scipy.ndimage.uniform_filter(grid.reshape(-1, CELLS, CELLS), (0, 3, 3), mode="constant")
+        return np.maximum(9.0 * mean.ravel()[self._place].astype(np.float64), 0)

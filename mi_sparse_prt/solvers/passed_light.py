@@ -1,0 +1,155 @@
+"""Light that goes straight through surfaces that take a part of it: masks, thin panes, ``null``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.operators.operator import Ids
+from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
+from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.refined_mean import Doubles, Estimate, RefinedMean, Round, compared
+from mi_sparse_prt.solvers.specular_chains import LANES, Sparse
+
+STRATA = 1, 2, 3, 4, 8  # per axis of a texel
+FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
+
+
+class PassingLight:
+    """Light that goes straight through surfaces that take a part of it."""
+
+    def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
+        self._problem, self._ids, self._power, self._seeds = problem, ids, power, iter(seeds)
+        strata = max(1, FINE // problem.emission.resolution)
+        #: Which points see the centres of texels, where rays are at these.
+        self.seen: Bits | None = None
+        if problem.basis == "direction" or strata == 1:
+            self.seen, self._found = _seen_and_passed(DirectSolver(replace(problem, basis="direction")), ids)
+        else:
+            self._found = passed_light(DirectSolver(problem, strata, next(self._seeds)), ids)
+        self._rays = len(ids) * problem.emission.size * (strata**2 if self.seen is None else 1)
+        self._rows, self._texels = _with_neighbours(self._found, problem)
+
+    def estimated(self, across: int) -> RefinedMean:
+        """As many strata in each texel as the noise asks for, first so many per axis; none in the direction basis.
+
+        Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
+        least where strata are in proportion to the fifth root of each texel's own, which two first halves tell,
+        averaged with those of its neighbours.
+        """
+        if self._problem.basis == "direction":
+            return RefinedMean(compared([[self._found] * 3] * 2, self._power, self._rays))
+        strata = np.full(len(self._rows), across)
+        first, squares = self._sampled(strata)
+        if not len(strata) or across >= STRATA[-1]:
+            return RefinedMean(first)
+        law = self._averaged(squares) * across**3
+        between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
+
+        def sample(wanted: float) -> Round:
+            scale = (float((law**0.4).sum()) / wanted) ** (1 / 3)
+            strata = np.array(STRATA)[np.searchsorted(between, scale * law**0.2)]
+            expected = float((law / strata**3.0).sum())
+            return Round(self._sampled(strata)[0], expected, bool((strata == STRATA[-1]).all()))
+
+        return RefinedMean(first, sample)
+
+    def _averaged(self, squares: Doubles) -> Doubles:
+        """Squared noise of each element, averaged with its neighbours on the cubemap and one average element."""
+        shape = len(self._ids), self._problem.emission.size
+        noise = scipy.sparse.coo_array((squares, (self._rows, self._texels)), shape=shape).tocsr()
+        beside = _beside(self._problem)
+        total = scipy.sparse.csr_array(noise @ beside)[self._rows, self._texels]
+        return (np.asarray(total).ravel() + squares.mean()) / (np.diff(beside.indptr)[self._texels] + 1)
+
+    def _sampled(self, strata: NDArray[np.int64]) -> tuple[Estimate, Doubles]:
+        """Light through strata of each texel, twice; and the squared noise of each element."""
+        depths, shape = max(self._problem.depths_apart, 1), self._found.shape
+        values = [np.zeros((len(strata), depths), np.float32) for _ in "ab"]
+        for own in np.unique(strata):
+            which = np.flatnonzero(strata == own)
+            solver = DirectSolver(self._problem, int(own))
+            for half in values:
+                passed = solver.partly_passed(
+                    self._ids[self._rows[which]], self._texels[which], next(self._seeds)
+                )
+                half[which[passed.elements]] = passed.values
+        every = np.arange(len(strata))
+        halves = [
+            [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] * 3 for half in values
+        ]
+        traced, self._rays = self._rays + 2 * int((strata**2).sum()), 0
+        spread = np.square(values[0] - values[1], dtype=np.float64).sum(axis=1) / 4
+        return compared(halves, self._power, traced), spread * self._power.max(axis=1)[self._rows]
+
+
+def _side_by_side(passed: PassedLight, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:
+    """Light of some of listed elements, told apart by depth, as a matrix (n, k * n_directions)."""
+    element, depth = np.nonzero(passed.values)
+    which = passed.elements[element]
+    columns = texels[which] + depth * (shape[1] // passed.values.shape[1])
+    return scipy.sparse.coo_array(
+        (passed.values[element, depth], (rows[which], columns)), shape=shape
+    ).tocsr()
+
+
+def _with_neighbours(found: Sparse, problem: Problem) -> tuple[Ids, Ids]:
+    """Rows and texels of a matrix's elements, and of those that are beside these on the cubemap."""
+    place = found.tocoo()
+    at = place.row, place.col % problem.emission.size
+    found = scipy.sparse.coo_array((place.data, at), shape=(found.shape[0], problem.emission.size)).tocsr()
+    grown = scipy.sparse.csr_array(found @ _beside(problem))
+    rows, texels = grown.tocoo().coords
+    return rows.astype(np.int64), texels.astype(np.int64)
+
+
+def _beside(problem: Problem) -> Sparse:
+    """Which texels (n_directions, n_directions) are the same, or beside each other on the cubemap: ones."""
+    beside = problem.emission.sides.tables.beside
+    texel = np.repeat(np.arange(len(beside)), beside.shape[1])
+    ones = np.ones(beside.size + len(beside), np.float32)
+    near = np.append(texel, np.arange(len(beside))), np.append(beside.ravel(), np.arange(len(beside)))
+    return scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2).tocsr()
+
+
+def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
+    """Light (n, k * m) of texels, at some points, of which surfaces on the way let a part through, straight on.
+
+    All of it, and nothing, is told by bits; here is what lies between, side by side by depth (``SpecularLight``).
+    """
+    size = direct.lighting.size
+    blocks = []
+    for a in range(0, len(ids), max(1, LANES // size)):
+        some = np.asarray(ids[a : a + max(1, LANES // size)])
+        place = np.repeat(some, size), np.tile(np.arange(size), len(some))
+        blocks.append(_rows_of(direct.partly_passed(*place), len(some), direct))
+    return _stacked(blocks, direct)
+
+
+def _seen_and_passed(direct: DirectSolver, ids: Ids) -> tuple[Bits, Sparse]:
+    """``passed_light`` in the direction basis, and which points see the centres of texels."""
+    seen, blocks, size = [direct.row_storage(0)], [], direct.block_size
+    for a in range(0, len(ids), size):
+        some = np.asarray(ids[a : a + size])
+        bits, passed = direct.rows_and_passed(some)
+        seen.append(bits)
+        blocks.append(_rows_of(passed, len(some), direct))
+    return np.concatenate(seen).astype(np.uint32, copy=False), _stacked(blocks, direct)
+
+
+def _rows_of(passed: PassedLight, n: int, direct: DirectSolver) -> Sparse:
+    """Light of elements that are numbered row by row, of n rows."""
+    size = direct.lighting.size
+    rows, texels = np.divmod(passed.elements, size)
+    every = PassedLight(np.arange(len(rows)), passed.values)
+    return _side_by_side(every, rows, texels, (n, size * passed.values.shape[1]))
+
+
+def _stacked(blocks: list[Sparse], direct: DirectSolver) -> Sparse:
+    """Of no block, too."""
+    none = (0, direct.lighting.size * max(direct.problem.depths_apart, 1))
+    return scipy.sparse.vstack([scipy.sparse.csr_array(none, dtype=np.float32), *blocks], format="csr")
