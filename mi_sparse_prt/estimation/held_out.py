@@ -292,7 +292,7 @@ class _Estimator:
 
     @cached_property
     def _specular_energy(self) -> Doubles:
-        """Of the light by way of mirrors and glass, as this matrix has it, that each vertex sends on (n,)."""
+        """Of light by way of mirrors and glass, as this matrix has it, that vertices send on (n,), by depth."""
         operator, albedo = self._transport.operators["specular"], self._problem.reflection.albedo
         power, total = np.square(albedo.astype(np.float64)), np.zeros(len(albedo))
         for some in operator.by_depth or (operator,):

@@ -9,7 +9,8 @@ from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.element_sampling import Effort
+from mi_sparse_prt.estimation.held_out import _Estimator, held_out_error
 from mi_sparse_prt.measurement.pixels import camera_pixels
 from mi_sparse_prt.methods.execution import matrix_of
 from mi_sparse_prt.methods.plan import Plan
@@ -544,3 +545,33 @@ def test_mitsuba_renders_the_same_matrix():
     assert found["left_out"] == []
     with pytest.raises(PrtError, match="directional lights do not shine through glass"):
         prt.validate(scene, replace(transport, basis="direction"), progress=False)
+
+
+def test_few_rows_stand_for_all():
+    """
+    Expected: of specular light, rows that are drawn where it is have its energy, and that of light spread evenly, on
+        average; each mesh has rows.
+    """
+    scene, lighting = build(0.3, **objects(0.6)), prt.CubemapLighting(4)
+    problem = replace(problem_at(scene, lighting, basis="texel"), specular_apart=True)
+    plan = Plan("edges", "gather", 64, 0.1)
+    transport = prt.precompute(scene, lighting, plan, "texel", problem.max_depth, progress=False)
+    effort = Effort(specular=64)
+    estimator = _Estimator(problem, transport, effort, np.random.SeedSequence(1), False)
+    energy, rng, found = estimator._specular_energy, np.random.default_rng(2), []
+    parts = transport.operators["specular"].by_depth
+    squares = sum(
+        np.square(part.rows(np.arange(scene.n_vertices)).astype(np.float64)).sum(axis=1) for part in parts
+    )
+    assert energy == pytest.approx((squares * problem.reflection.albedo**2).sum(axis=1))
+    for _ in range(600):
+        sums = np.zeros(2)
+        for mesh in transport.meshes:
+            ids, weights = estimator._specular_rows(mesh.vertices, 1.0, rng)
+            assert len(ids) and ids.min() >= mesh.vertices.start and ids.max() < mesh.vertices.stop
+            sums += weights.sum(), weights @ energy[ids]
+        found.append(sums / (scene.n_vertices, energy.sum()))
+    mean, spread = np.mean(found, axis=0), np.std(found, axis=0, ddof=1)
+    print(f"even {mean[0]:.4f}, specular {mean[1]:.4f}; one draw {spread}")
+    assert (spread < 0.15).all()
+    assert mean == pytest.approx(1, abs=4 * spread.max() / np.sqrt(600))
