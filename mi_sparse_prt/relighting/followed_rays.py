@@ -64,7 +64,7 @@ class Seen(NamedTuple):
     radiance: Any
     si: Any
     whole: Any
-    partly: Any
+    partly: Any = False
 
 
 def surfaces_to_follow(scene: Scene, reflection: Reflection | None = None) -> list[mi.BSDF]:

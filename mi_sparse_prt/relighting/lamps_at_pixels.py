@@ -97,7 +97,7 @@ class LampLitIntegrator(RelitIntegrator):
         whole = is_one_of(self._followed, si)
         if self._caustics:
             direct += self._by_mirrors(si, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
-        return Seen(direct, si, whole, mi.Mask(False))
+        return Seen(direct, si, whole)
 
     def _by_mirrors(
         self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
@@ -118,12 +118,12 @@ class LampLitIntegrator(RelitIntegrator):
             radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
             rough = active & is_one_of(self._rough_glass, met)
             if not self._rough_glass or not self._unmet:
-                return Seen(radiance, met, rough, mi.Mask(False))
+                return Seen(radiance, met, rough)
             asked = rough & ~way.last
             there, light = self._scene.sample_emitter_direction(met, sampler.next_2d(asked), True, asked)
             asked &= there.delta
             value = met.bsdf().eval(mi.BSDFContext(), met, met.to_local(there.d), asked)
-            return Seen(radiance + dr.select(asked, value * light, 0), met, rough, mi.Mask(False))
+            return Seen(radiance + dr.select(asked, value * light, 0), met, rough)
 
         ray = si.spawn_ray(si.to_world(sample.wo))
         found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth, depth)
