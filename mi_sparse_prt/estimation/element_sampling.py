@@ -269,3 +269,19 @@ def _near_edge(
         if bit_of(bits, j) != own and _cosine(normal, directions[j]) > 0:
             return True
     return False
+
+
+def draw_by_energy(
+    energy: NDArray[np.float64], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Numbers (k,) of some of those whose energies are given (m,), and how many each stands for.
+
+    Half are drawn where much is, the others anywhere. All, once, if they are not more than ``count``.
+    """
+    m = len(energy)
+    if count >= m:
+        return np.arange(m), np.ones(m)
+    bright = energy / energy.sum() if energy.any() else np.full(m, 1 / m)
+    chance = (1 / m + bright) / 2
+    chosen = np.sort(rng.choice(m, count, p=chance / chance.sum()))
+    return chosen, 1 / (count * chance[chosen])

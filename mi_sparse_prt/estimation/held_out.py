@@ -25,6 +25,7 @@ from mi_sparse_prt.estimation.darkness import DARK, unoccluded_squares
 from mi_sparse_prt.estimation.element_sampling import (
     Chosen,
     Effort,
+    draw_by_energy,
     for_direct_light,
     for_indirect_light,
 )
@@ -279,16 +280,12 @@ class _Estimator:
         }
 
     def _specular_rows(self, mesh: slice, part: float, rng: np.random.Generator) -> tuple[Ids, Doubles]:
-        """Some rows of a mesh, and how many each stands for; half of them where much light is, the others anywhere."""
+        """Some rows of a mesh, and how many each stands for."""
         own, size = self._specular_energy[mesh], mesh.stop - mesh.start
         even, bright = size / len(self._specular_energy), own.sum() / max(self._specular_energy.sum(), 1e-300)
         count = max(1, round(part * self._effort.specular * (even + bright) / 2))
-        if count >= size:
-            return np.arange(mesh.start, mesh.stop), np.ones(size)
-        lit = own / own.sum() if own.any() else np.full(size, 1 / size)
-        chance = (1 / size + lit) / 2
-        chosen = np.sort(rng.choice(size, count, p=chance / chance.sum()))
-        return mesh.start + chosen, 1 / (count * chance[chosen])
+        chosen, weights = draw_by_energy(own, count, rng)
+        return mesh.start + chosen, weights
 
     @cached_property
     def _specular_energy(self) -> Doubles:

@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.estimation.element_sampling import draw_by_energy
 from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
+from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
 
-POINTS = 256  # of each group, at most
-# of all, about: where groups and lamps are many, each has fewer points. Twice as many told no more of a kitchen: 2.1 to
-# 2.9% by four seeds
-ELEMENTS = 1 << 13
+ELEMENTS = 1 << 12  # in all, about. Twice as many told no more of a kitchen: 2.2 to 2.5% by four seeds
+LEAST = 2  # of each group
 SPP = 256  # of 64, those of a lamp behind glass told an error of 0
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
+BLOCK = 4096  # points at a time
 
 Doubles: TypeAlias = NDArray[np.float64]
 
@@ -30,30 +31,41 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     Of a matrix that has only what surfaces reflect, that is the error of this, relative to what lamps send on, too.
     """
     stream = random_stream(seed, HELD_OUT)
-    rng, m, seeds = np.random.default_rng(stream), problem.emission.size, element_seeds(stream, 4)
+    rng, seeds = np.random.default_rng(stream), element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
-    groups = transport.measurement.groups
-    most = int(np.clip(ELEMENTS // (m * len(groups)), 2, POINTS))
-    sizes = np.array([group.vertices.stop - group.vertices.start for group in groups])
-    counts = np.minimum(sizes, most)
-    drawn = [
-        np.sort(rng.choice(size, count, replace=False)) for size, count in zip(sizes, counts, strict=True)
-    ]
-    ids = np.concatenate([group.vertices.start + some for group, some in zip(groups, drawn, strict=True)])
-    asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
-    # those of all groups at once: each evaluation starts dozens of kernels
+    groups, energy = transport.measurement.groups, _energy(transport, albedo)
+    drawn = [_drawn(energy, group.vertices, rng) for group in groups]
+    points, lamps, weights = (np.concatenate(part) for part in zip(*drawn, strict=True))
+    asked = points, lamps  # those of all groups at once: each evaluation starts dozens of kernels
     ours = transport.incident.elements(*asked).astype(np.float64)
     seen = "direct" in transport.operators
     x, y = (_true(problem, asked, seen, *pair) for pair in (seeds[:2], seeds[2:]))
-    power = albedo[asked[0]] ** 2
+    power = albedo[points] ** 2
     sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x.light, ours - y.light), (x.all, y.all)))
-    weights = np.repeat(sizes / counts, m * counts)
     columns = weights, *(column[:, None] for column in sums)
-    ends = np.cumsum(m * counts)[:-1]
+    ends = np.cumsum([len(one) for one, _, _ in drawn])[:-1]
     parts = zip(*(np.split(column, ends) for column in columns), strict=True)
     return estimate_errors(
         {(group.name, "all"): Sample(*part) for group, part in zip(groups, parts, strict=True)}
     )
+
+
+def _energy(transport: LightTransport, albedo: Doubles) -> Doubles:
+    """What vertices send on of each lamp, squared, as the matrix has it (n, m)."""
+    energy = np.empty((len(albedo), transport.incident.shape[1]), np.float64)
+    for a in range(0, len(albedo), BLOCK):
+        ids = np.arange(a, min(a + BLOCK, len(albedo)))
+        energy[ids] = np.square(transport.incident.rows(ids) * albedo[ids, None]).sum(axis=2)
+    return energy
+
+
+def _drawn(energy: Doubles, group: slice, rng: np.random.Generator) -> tuple[Ids, Ids, Doubles]:
+    """Points, lamps and weights of elements of a group."""
+    own, m = energy[group].ravel(), energy.shape[1]
+    even, bright = len(own) / energy.size, own.sum() / max(energy.sum(), 1e-300)
+    count = max(LEAST, round(ELEMENTS * (even + bright) / 2))
+    chosen, weights = draw_by_energy(own, count, rng)
+    return group.start + chosen // m, chosen % m, weights
 
 
 class _True(NamedTuple):

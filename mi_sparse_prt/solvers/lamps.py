@@ -21,6 +21,8 @@ from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # rays per wavefront
 SHARED_OUT = 9  # spawn key
+DIRECT = 12  # spawn key
+SELDOM = 0.5  # a ray of the surface counts more than shadow rays of its direction, though these are many more
 PILOT = 4  # for so many paths, one more tells how many an element needs
 MOST = 256  # times as many paths as others may an element have
 
@@ -28,14 +30,15 @@ Floats = NDArray[np.float32]
 
 
 class LampRays:
-    """Unit-albedo direct light of lamps at points, by shadow rays to samples of them.
+    """Unit-albedo direct light of lamps at points, by shadow rays to samples of them and a few rays that may meet them.
 
     Parameters
     ----------
     problem : Problem
         Whose emission space is sampled.
     strata : int
-        Per axis of a lamp: strata**2 rays per element, each at a random place of its stratum.
+        Per axis of a lamp: strata**2 shadow rays per element, each at a random place of its stratum. Of the surface,
+        ``strata`` rays go out to look for lamps that are near, and as many more, strata**2 where one is.
     seed : int
     """
 
@@ -47,31 +50,46 @@ class LampRays:
 
     @property
     def rays_per_element(self) -> int:
-        """Shadow rays of one element."""
-        return self._strata**2
+        """Rays of one element."""
+        return self._strata * (self._strata + 2)
 
     def elements(
         self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int | None = None
     ) -> Estimate:
         """Irradiance / pi of listed elements: mean (m, 3) and the variance of that mean, strata left out of account."""
-        size, n = max(1, LANES // self.rays_per_element), len(point_ids)
+        n, stream = len(point_ids), random_stream(self._seed if seed is None else seed, DIRECT)
+        looking, *seeds = element_seeds(stream, 3)
         mean, variance = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-        for a in range(0, n, size):
-            part = slice(a, a + size)
-            points, lamps = (on_device(mi.UInt32, ids[part]) for ids in (point_ids, columns))
-            found = self._samples(points, lamps, self._seed if seed is None else seed)
-            powers = [x * x for x in found]
-            dr.eval(found, powers)
-            sums, squares = (
-                np.stack(
-                    [dr.block_reduce(dr.ReduceOp.Add, x, self.rays_per_element).numpy() for x in xs], axis=1
-                )
-                / self.rays_per_element
-                for xs in (found, powers)
-            )
-            mean[part] = sums
-            variance[part] = np.maximum(squares - sums**2, 0) / max(self.rays_per_element - 1, 1)
+        counts = self._surface_counts(point_ids, columns, looking)
+        for count in np.unique(counts).tolist():
+            those, size = np.flatnonzero(counts == count), max(1, LANES // (self._strata**2 + count))
+            for a in range(0, len(those), size):
+                some = those[a : a + size]
+                asked = on_device(mi.UInt32, point_ids[some]), on_device(mi.UInt32, columns[some])
+                kinds = [(self._shadow_rays, self._strata**2), (self._rays_of_the_surface, count)]
+                for (samples, rays), own in zip(kinds[: 2 if count else 1], seeds, strict=False):
+                    found = _moments(samples(*asked, count, own), rays)
+                    mean[some] += found.mean[:, :3]
+                    variance[some] += found.variance[:, :3]
         return Estimate(mean, variance)
+
+    def _surface_counts(
+        self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int
+    ) -> NDArray[np.int64]:
+        """How many rays of the surface each element has (m,): many where shadow rays alone would be noisy, if any."""
+        counts = np.full(
+            len(point_ids), self._strata if len(self._emission.unmet) < self._emission.size else 0
+        )
+        if counts.any():
+            size = LANES // self._strata
+            for a in range(0, len(counts), size):
+                part = slice(a, a + size)
+                asked = on_device(mi.UInt32, point_ids[part]), on_device(mi.UInt32, columns[part])
+                found = _moments(self._rays_of_the_surface(*asked, self._strata, seed), self._strata)
+                seldom, whole = found.mean[:, 3:].T
+                # more noise would be left in it than in what shadow rays find
+                counts[part][seldom * self._strata > whole] = self._strata**2
+        return counts
 
     def rows(self, point_ids: NDArray[np.integer]) -> Floats:
         """Whole rows (k, size, 3)."""
@@ -79,36 +97,108 @@ class LampRays:
         found = self.elements(np.repeat(point_ids, m), np.tile(np.arange(m), len(point_ids)))
         return found.mean.reshape(len(point_ids), m, 3)
 
-    def _samples(self, points: mi.UInt32, lamps: mi.UInt32, seed: int) -> list[mi.Float]:
-        """One value per channel and ray, rays of an element side by side."""
-        lane = dr.arange(mi.UInt32, len(points) * self.rays_per_element)
-        element = lane // self.rays_per_element
-        stratum = lane - element * self.rays_per_element
-        point, lamp = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, lamps, element)
-        rng = random_generator(self._points.key(point), lamp, stratum, seed)
+    def _shadow_rays(self, points: mi.UInt32, lamps: mi.UInt32, others: int, seed: int) -> list[mi.Float]:
+        """One value per channel and ray, rays of an element side by side; it has so many others, of the surface."""
+        point, lamp, stratum, rng = self._lanes(points, lamps, self._strata**2, seed)
         row = stratum // self._strata
         uv = mi.Point2f(
             (mi.Float(stratum - row * self._strata) + rng.next_float32()) / self._strata,
             (mi.Float(row) + rng.next_float32()) / self._strata,
         )
-        position = self._scene.to_world(self._points.position(point))
-        direction, irradiance, distance, _ = self._emission.sample(lamp, position, uv)
+        origin = self._origin(point)
+        direction, irradiance, distance, density = self._emission.sample(
+            lamp, self._scene.to_world(origin), uv
+        )
         cosine = dr.dot(self._points.normal(point), direction)
         lit = (cosine > 0) & (dr.max(irradiance) > 0)
-        lamp_at = self._points.position(point) + direction * (distance * self._scene.scale)
+        lamp_at = origin + direction * (distance * self._scene.scale)
         ray = ray_to(start_ray(self._points, point, direction), lamp_at)
         value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0) * self._arriving(ray, lamp_at, lit)
+        value *= dr.select(density > 0, 1 - self._of_the_surface(cosine, density, others), 1)
         return [value.x, value.y, value.z]
+
+    @dr.syntax
+    def _rays_of_the_surface(
+        self, points: mi.UInt32, lamps: mi.UInt32, rays: int, seed: int
+    ) -> list[mi.Float]:
+        """The same by cosine-distributed rays: next to a lamp a few places of it send nearly all light.
+
+        Two more values tell how bright the light is that shadow rays would seldom find, and all of it.
+        """
+        point, lamp, stratum, rng = self._lanes(points, lamps, rays, seed)
+        across = (mi.Float(stratum) + rng.next_float32()) / dr.opaque(mi.Float, rays)
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(across, rng.next_float32()))
+        ray = start_ray(self._points, point, mi.Frame3f(self._points.normal(point)).to_world(local))
+        scene, emission = self._scene.unsplit, self._emission
+        value, share, left, active = mi.Color3f(0), mi.Color3f(1), self._passable(), mi.Mask(True)
+        whole, seldom = mi.Float(0), mi.Float(0)
+        while active:
+            si = scene.ray_intersect(ray, active)
+            there, from_world = in_world(self._scene, si, ray, active)
+            met, radiance = emission.element_of(there, from_world, active)
+            from_world.o = self._scene.to_world(self._origin(point))
+            found = active & (met == mi.Int32(lamp))
+            density = emission.density(there, from_world, found)
+            part = dr.select(found & (density > 0), self._of_the_surface(local.z, density, rays), 0)
+            value += dr.select(part > 0, share * radiance * part, 0)
+            bright = dr.select(found, dr.max(share * radiance), 0)
+            whole += bright
+            seldom += dr.select(part > SELDOM, bright, 0)
+            active &= si.is_valid() & (left > 0)
+            active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
+            share *= dr.select(active, mi.Color3f(si.bsdf().eval_null_transmission(si, active)), 1)
+            active &= dr.max(share) > 0
+            left -= 1
+            ray = si.spawn_ray(ray.d)
+        return [value.x, value.y, value.z, seldom, whole]
+
+    def _origin(self, point: mi.UInt32) -> mi.Point3f:
+        """Where rays above the surface begin: next to a lamp, densities of both kinds agree for the same place only."""
+        return start_ray(self._points, point, mi.Vector3f(self._points.normal(point))).o
+
+    def _lanes(
+        self, points: mi.UInt32, lamps: mi.UInt32, rays: int, seed: int
+    ) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.PCG32]:
+        """The point, the lamp and the stratum of each ray, and its random numbers."""
+        lane, each = dr.arange(mi.UInt32, len(points) * rays), dr.opaque(mi.UInt32, rays)
+        element = lane // each
+        stratum = lane - element * each
+        point, lamp = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, lamps, element)
+        return point, lamp, stratum, random_generator(self._points.key(point), lamp, stratum, seed)
+
+    def _of_the_surface(self, cosine: mi.Float, density: mi.Float, rays: int) -> mi.Float:
+        """How much a direction counts among rays of the surface.
+
+        By the power heuristic (Veach 1997, 9.2.4): shadow rays are stratified better, and tell nearly all where they
+        are many.
+        """
+        own = dr.maximum(cosine, 0) * (dr.opaque(mi.Float, rays) * dr.inv_pi)
+        return own**2 / (own**2 + (self._strata**2 * density) ** 2)
+
+    def _passable(self) -> mi.UInt32:
+        """Surfaces that light may pass."""
+        return dr.opaque(mi.UInt32, self._max_depth - 2 if self._max_depth >= 0 else 1 << 30)
 
     def _arriving(self, ray: mi.Ray3f, lamp_at: mi.Point3f, active: mi.Mask) -> mi.Color3f:
         """The share of light that arrives along shadow rays: what masks, thin panes and ``null`` let through counts."""
         scene = self._scene.unsplit
         if not self._scene.passes_straight:
             return dr.select(scene.ray_test(ray, active), mi.Color3f(0), 1)
-        most = dr.opaque(mi.UInt32, self._max_depth - 2 if self._max_depth >= 0 else 1 << 30)
         onwards = lambda si: ray_to(si.spawn_ray(ray.d), lamp_at)  # noqa: E731
-        share, _, _ = pass_straight(scene, ray, active, most, onwards, lambda passed: passed)
+        share, _, _ = pass_straight(scene, ray, active, self._passable(), onwards, lambda passed: passed)
         return share
+
+
+def _moments(samples: list[mi.Float], count: int) -> Estimate:
+    """Means (m, 3) of so many samples each, side by side, and the variance of these means."""
+    powers = [x * x for x in samples]
+    dr.eval(samples, powers)
+    mean, squares = (
+        np.stack([dr.block_reduce(dr.ReduceOp.Add, x, count).numpy() for x in xs], axis=1) / count
+        for xs in (samples, powers)
+    )
+    variance = np.maximum(squares - mean**2, 0) / max(count - 1, 1)
+    return Estimate(mean.astype(np.float32), variance.astype(np.float32))
 
 
 class LampPaths(PathSolver):
