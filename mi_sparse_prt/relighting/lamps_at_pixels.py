@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 
@@ -11,6 +13,23 @@ from mi_sparse_prt.scene.materials import is_one_of
 from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.paths import has_mirrors
+
+
+class _Onwards(NamedTuple):
+    """Rays that surfaces send on, but into single directions, which are followed anyway.
+
+    Attributes
+    ----------
+    ray : Ray3f
+    met : SurfaceInteraction3f
+        By these rays.
+    weight : Color3f
+        Of what they find; 0 where there are none.
+    """
+
+    ray: Any
+    met: Any
+    weight: Any
 
 
 class LampLitIntegrator(RelitIntegrator):
@@ -61,13 +80,16 @@ class LampLitIntegrator(RelitIntegrator):
         if self._goes_on:
             direct, _ = follow(self._seen, ray, sampler, active, self._max_depth)
         else:
-            direct = self._direct(self._traced.ray_intersect(ray, active), sampler, active, active)
+            direct, _ = self._direct(self._traced.ray_intersect(ray, active), sampler, active, active)
         return value + direct, valid
 
     def _direct(
         self, si: mi.SurfaceInteraction3f, sampler: mi.Sampler, seen: mi.Mask, reflects: mi.Mask
-    ) -> mi.Color3f:
-        """Lamps that are ``seen``, and what surfaces reflect of them: both kinds of rays, weighted as in ``path``."""
+    ) -> tuple[mi.Color3f, _Onwards]:
+        """Lamps that are ``seen``, and what surfaces reflect of them: both kinds of rays, weighted as in ``path``.
+
+        Second, where rays of the BSDF lead.
+        """
         value = dr.select(seen, si.emitter(self._scene, seen).eval(si, seen), 0)
         bsdf, reflects = si.bsdf(), reflects & si.is_valid()
         asked = reflects & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -81,40 +103,37 @@ class LampLitIntegrator(RelitIntegrator):
         share = dr.select(there.delta, 1, there.pdf / (there.pdf + density))
         value += dr.select(asked, reflected * light * share, 0)
 
-        met = self._traced.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), reflects)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        met = self._traced.ray_intersect(ray, reflects)
         radiance = met.emitter(self._scene, reflects).eval(met, reflects)
         single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
         towards = mi.DirectionSample3f(self._scene, met, si)
         other = self._scene.pdf_emitter_direction(si, towards, reflects & ~single & met.is_valid())
         share = dr.select(single, 1, sample.pdf / (sample.pdf + other))
         lit = reflects & ~dr.all(radiance == 0)
-        return value + dr.select(lit, weight * radiance * share, 0)
+        value += dr.select(lit, weight * radiance * share, 0)
+        return value, _Onwards(ray, met, dr.select(reflects & ~single, weight, 0))
 
     def _seen(self, ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
         """See ``follow``; a lamp seen in a mirror is among the mirror's direct light."""
         si, reflects = self._traced.ray_intersect(ray, active), active & ~way.last
-        direct = self._direct(si, sampler, reflects & (way.depth == 0), reflects)
+        direct, onwards = self._direct(si, sampler, reflects & (way.depth == 0), reflects)
         whole = is_one_of(self._followed, si)
         if self._caustics:
-            direct += self._by_mirrors(si, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
+            direct += self._by_mirrors(onwards, way.depth + 1, sampler, reflects & si.is_valid() & ~whole)
         return Seen(direct, si, whole)
 
     def _by_mirrors(
-        self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
+        self, onwards: _Onwards, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Mask
     ) -> mi.Color3f:
         """What surfaces reflect of lamps whose light came by mirrors and glass; ``depth`` surfaces count already.
 
         Of points and suns, which rays cannot meet, what leaves rough glass, by a shadow ray there.
         """
-        smooth = mi.BSDFContext()
-        smooth.type_mask = int(mi.BSDFFlags.Smooth)  # single directions are followed anyway
-        active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
-        u, v = sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
-        sample, weight = si.bsdf().sample(smooth, si, u, v, active)
 
         def emitted(ray: mi.Ray3f, way: Way, sampler: mi.Sampler, active: mi.Mask) -> Seen:
-            met = self._traced.ray_intersect(ray, active)
             lit = active & (way.depth > depth)
+            met = dr.select(way.depth > depth, self._traced.ray_intersect(ray, lit), onwards.met)
             radiance = dr.select(lit, met.emitter(self._scene, lit).eval(met, lit), 0)
             rough = active & is_one_of(self._rough_glass, met)
             if not self._rough_glass or not self._unmet:
@@ -125,9 +144,9 @@ class LampLitIntegrator(RelitIntegrator):
             value = met.bsdf().eval(mi.BSDFContext(), met, met.to_local(there.d), asked)
             return Seen(radiance + dr.select(asked, value * light, 0), met, rough)
 
-        ray = si.spawn_ray(si.to_world(sample.wo))
-        found, _ = follow(emitted, ray, sampler, active & (dr.max(weight) > 0), self._max_depth, depth)
-        return dr.select(active, weight * found, 0)
+        active &= onwards.met.is_valid() & (dr.max(onwards.weight) > 0)
+        found, _ = follow(emitted, onwards.ray, sampler, active, self._max_depth, depth)
+        return dr.select(active, onwards.weight * found, 0)
 
 
 def without_environment(scene: mi.Scene) -> mi.Scene:
