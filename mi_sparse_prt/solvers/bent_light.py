@@ -20,9 +20,8 @@ from mi_sparse_prt.solvers.specular_chains import (
     draw_strata,
 )
 
-FEWEST = (
-    1 << 18
-)  # rays at first, if that is no more than one of each cell: of very few, all may miss the light
+# rays at first, if that is no more than one of each cell: of very few, all may miss the light
+FEWEST = 1 << 18
 GROWTH = 4.0  # times all rays before, at most in one round: those that come after it are better placed
 SHRINKING = 1 / 8  # of them, at least: fewer tell too little, also of their own noise
 LEAST_SHARE = 1 / 64  # of light, as which less counts: what one ray saw of a cell may be less than is there
@@ -130,11 +129,13 @@ class _Moments:
         self._power = np.maximum(power, least)[cells.rows]
         self._squares, self._traced = np.zeros(len(rows)), np.zeros(len(rows))
         self._noise, self._rays = 0.0, np.ones(len(rows))  # of the last estimate
+        self._known: Doubles | None = None
 
     def add(self, strata: Strata, squares: Floats) -> None:
         """What more rays found."""
         self._squares[strata.which] += squares
         self._traced[strata.which] += strata.across**2
+        self._known = None
 
     @property
     def traced(self) -> float:
@@ -163,8 +164,11 @@ class _Moments:
     @property
     def _second(self) -> Doubles:
         """Moments (m,), those of neighbouring cells together, as if there were one average ray more."""
-        average = self._squares.sum() / max(self._traced.sum(), 1)
-        return (self._around(self._squares) + average) / (self._around(self._traced) + 1) * self._power
+        if self._known is None:
+            average = self._squares.sum() / max(self._traced.sum(), 1)
+            around = self._around(self._squares), self._around(self._traced)
+            self._known = (around[0] + average) / (around[1] + 1) * self._power
+        return self._known
 
     def _around(self, values: Doubles) -> Doubles:
         """Sums over each cell and those beside it."""
