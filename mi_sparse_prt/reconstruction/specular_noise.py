@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
+import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.sparse_product import multiply_sparse
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.reconstruction.surface_smoothing import STRIDES, SurfaceSmoothing, smoothing_levels
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -59,10 +61,10 @@ class SpecularNoise:
         for channel, pair in enumerate(zip(*halves, strict=True)):
             a, b = (multiply_sparse(half, columns) for half in pair)
             smooth_a, smooth_b = (multiply_sparse(self._near, x) for x in (a, b))
-            noise, own = _squares(a - b), power[:, channel : channel + 1] / SUMS
-            error = (_squares(smooth_a - b) + _squares(smooth_b - a)) / 2
+            noise, own = _apart(a, b), power[:, channel : channel + 1] / SUMS
+            error = (_apart(smooth_a, b) + _apart(smooth_b, a)) / 2
             before += own * noise / 4
-            after += own * (error - noise / 2 - _squares(smooth_a - smooth_b) / 4)
+            after += own * (error - noise / 2 - _apart(smooth_a, smooth_b) / 4)
         pooled = [self._smoothing.pooled(x.astype(np.float32)) for x in (before, after)]
         chosen = pooled[1] < pooled[0]
         self._share = self._smoothing.pooled(chosen.astype(np.float32))
@@ -81,5 +83,17 @@ class SpecularNoise:
         return scipy.sparse.csr_array((kept + given).astype(np.float32) @ light)
 
 
-def _squares(x: Floats) -> NDArray[np.float64]:
-    return np.square(x, dtype=np.float64).sum(axis=1, keepdims=True)
+def _apart(x: Floats, y: Floats) -> NDArray[np.float64]:
+    """Squared distances of rows (n, 1)."""
+    squares = np.empty((len(x), 1))
+    run_in_parts(_add_squares, len(x), x, y, squares)
+    return squares
+
+
+@numba.njit(nogil=True, cache=True)
+def _add_squares(first: int, last: int, x: Floats, y: Floats, squares: NDArray[np.float64]) -> None:
+    for i in range(first, last):
+        total = 0.0
+        for k in range(x.shape[1]):
+            total += (x[i, k] - y[i, k]) ** 2
+        squares[i, 0] = total

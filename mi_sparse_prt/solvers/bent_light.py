@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.refined_mean import Averaging, Doubles, Estimate, RefinedMean, Round, compared
@@ -123,12 +124,12 @@ class _Moments:
     """
 
     def __init__(self, cells: Cells, power: Doubles) -> None:
-        lit, rows = np.unique(cells.rows, return_inverse=True)
-        self._lit, self._place = len(lit), rows * CELLS**2 + cells.numbers
+        starts = np.flatnonzero(np.diff(cells.rows, prepend=-1))
+        self._numbers, self._starts = cells.numbers, np.append(starts, len(cells.rows))
         least = LEAST_SHARE * power.max(initial=0)  # black vertices have rays, too
         self._power = np.maximum(power, least)[cells.rows]
-        self._squares, self._traced = np.zeros(len(rows)), np.zeros(len(rows))
-        self._noise, self._rays = 0.0, np.ones(len(rows))  # of the last estimate
+        self._squares, self._traced = np.zeros(len(cells.rows)), np.zeros(len(cells.rows))
+        self._noise, self._rays = 0.0, np.ones(len(cells.rows))  # of the last estimate
         self._known: Doubles | None = None
 
     def add(self, strata: Strata, squares: Floats) -> None:
@@ -166,13 +167,37 @@ class _Moments:
         """Moments (m,), those of neighbouring cells together, as if there were one average ray more."""
         if self._known is None:
             average = self._squares.sum() / max(self._traced.sum(), 1)
-            around = self._around(self._squares), self._around(self._traced)
-            self._known = (around[0] + average) / (around[1] + 1) * self._power
+            sums = self._squares, self._traced, self._power
+            self._known = np.empty(len(self._numbers))
+            run_in_parts(
+                _smoothed, len(self._starts) - 1, self._starts, self._numbers, sums, average, self._known
+            )
         return self._known
 
-    def _around(self, values: Doubles) -> Doubles:
-        """Sums over each cell and those beside it."""
-        grid = np.zeros(self._lit * CELLS**2, np.float32)
-        grid[self._place] = values
-        mean = scipy.ndimage.uniform_filter(grid.reshape(-1, CELLS, CELLS), (0, 3, 3), mode="constant")
-        return np.maximum(9.0 * mean.ravel()[self._place].astype(np.float64), 0)
+
+@numba.njit(nogil=True, cache=True)
+def _smoothed(
+    first: int,
+    last: int,
+    starts: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    sums: tuple[Doubles, Doubles, Doubles],
+    average: float,
+    moments: Doubles,
+) -> None:
+    """Moments of the cells of some points, of whose cells the first ones are given, with those of cells beside them."""
+    squares, traced, power = sums
+    grid = np.zeros((CELLS + 2, CELLS + 2, 2))
+    for i in range(first, last):
+        grid[:] = 0
+        for k in range(starts[i], starts[i + 1]):
+            grid[1 + numbers[k] // CELLS, 1 + numbers[k] % CELLS, 0] = squares[k]
+            grid[1 + numbers[k] // CELLS, 1 + numbers[k] % CELLS, 1] = traced[k]
+        for k in range(starts[i], starts[i + 1]):
+            row, column = numbers[k] // CELLS, numbers[k] % CELLS
+            square, count = 0.0, 0.0
+            for y in range(row, row + 3):
+                for x in range(column, column + 3):
+                    square += grid[y, x, 0]
+                    count += grid[y, x, 1]
+            moments[k] = (square + average) / (count + 1) * power[k]

@@ -53,6 +53,7 @@ COLUMNS = 256  # of a dense matrix that G is applied to at a time
 NEGLIGIBLE = 1e-3  # light, relative to all, that later bounces may lack at any vertex
 JUDGED = 2  # times 32 sums of columns tell the noise of rays
 LONGEST = 1024  # bounces after which light is taken not to end
+ROWS = 1 << 10  # whose squares are summed up at a time
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -348,9 +349,14 @@ class FiniteElements:
         return GatheredByDepth(self._terms(light, sizes, first.right, least), first.left_out)
 
     def _energies(self, x: Floats) -> NDArray[np.float64]:
-        """Of each column."""
-        own = x if self.weights is None else x * self.weights[:, None]
-        return np.square(own).sum(axis=0, dtype=np.float64)
+        """Of each column. Some rows at a time: new pages would take longer than the sums."""
+        total = np.zeros(x.shape[1])
+        for a in range(0, len(x), ROWS):
+            own = x[a : a + ROWS]
+            if self.weights is not None:
+                own = own * self.weights[a : a + ROWS, None]
+            total += np.square(own).sum(axis=0, dtype=np.float64)
+        return total
 
     def _reflect(
         self,

@@ -117,12 +117,28 @@ def draw_strata(
         Strata per axis, at most.
     seed : int
     """
-    own = mix(mix(keys ^ np.uint64(seed))) * 2.0**-64
-    chance = np.minimum(rays, 1)
-    drawn = (own[cells.rows] + _bayer(CELLS)[cells.numbers]) % 1
-    which = np.flatnonzero(drawn < chance)
-    across = np.clip(np.rint(np.sqrt(rays[which])), 1, most).astype(np.int64)
-    return Strata(cells.take(which), which, across, (1 / chance[which]).astype(np.float32))
+    own, drawn = mix(mix(keys ^ np.uint64(seed))) * 2.0**-64, np.empty(len(rays), np.bool_)
+    run_in_parts(_draw, len(rays), cells.rows, cells.numbers, own, _bayer(CELLS), rays, drawn)
+    which = np.flatnonzero(drawn)
+    wanted = rays[which]
+    across = np.clip(np.rint(np.sqrt(wanted)), 1, most).astype(np.int64)
+    return Strata(cells.take(which), which, across, (1 / np.minimum(wanted, 1)).astype(np.float32))
+
+
+@numba.njit(nogil=True, cache=True)
+def _draw(
+    first: int,
+    last: int,
+    rows: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    own: NDArray[np.float64],
+    bayer: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    drawn: NDArray[np.bool_],
+) -> None:
+    for i in range(first, last):
+        at = own[rows[i]] + bayer[numbers[i]]
+        drawn[i] = (at - 1 if at >= 1 else at) < rays[i]
 
 
 class ArrivedLight(NamedTuple):
