@@ -48,11 +48,6 @@ class LampRays:
         self._max_depth = problem.max_depth
         self._points = PointArrays(problem.points)
 
-    @property
-    def rays_per_element(self) -> int:
-        """Rays of one element."""
-        return self._strata * (self._strata + 2)
-
     def elements(
         self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int | None = None
     ) -> Estimate:
@@ -77,18 +72,16 @@ class LampRays:
         self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int
     ) -> NDArray[np.int64]:
         """How many rays of the surface each element has (m,): many where shadow rays alone would be noisy, if any."""
-        counts = np.full(
-            len(point_ids), self._strata if len(self._emission.unmet) < self._emission.size else 0
-        )
-        if counts.any():
-            size = LANES // self._strata
-            for a in range(0, len(counts), size):
-                part = slice(a, a + size)
-                asked = on_device(mi.UInt32, point_ids[part]), on_device(mi.UInt32, columns[part])
-                found = _moments(self._rays_of_the_surface(*asked, self._strata, seed), self._strata)
-                seldom, whole = found.mean[:, 3:].T
-                # more noise would be left in it than in what shadow rays find
-                counts[part][seldom * self._strata > whole] = self._strata**2
+        if len(self._emission.unmet) == self._emission.size:
+            return np.zeros(len(point_ids), np.int64)
+        counts, size = np.full(len(point_ids), self._strata), LANES // self._strata
+        for a in range(0, len(counts), size):
+            part = slice(a, a + size)
+            asked = on_device(mi.UInt32, point_ids[part]), on_device(mi.UInt32, columns[part])
+            found = _moments(self._rays_of_the_surface(*asked, self._strata, seed), self._strata)
+            seldom, whole = found.mean[:, 3:].T
+            # more noise would be left in it than in what shadow rays find
+            counts[part][seldom * self._strata > whole] = self._strata**2
         return counts
 
     def rows(self, point_ids: NDArray[np.integer]) -> Floats:
