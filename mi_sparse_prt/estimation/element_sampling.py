@@ -272,16 +272,34 @@ def _near_edge(
 
 
 def draw_by_energy(
-    energy: NDArray[np.float64], count: int, rng: np.random.Generator
+    energy: NDArray[np.floating], group: slice, count: int, least: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Numbers (k,) of some of those whose energies are given (m,), and how many each stands for.
+    """Some elements of a group: half are drawn where much energy is, the others anywhere.
 
-    Half are drawn where much is, the others anywhere. All, once, if they are not more than ``count``.
+    Parameters
+    ----------
+    energy : (n,) float
+        Of all elements; not below 0.
+    group : slice
+    count : int
+        Elements of all groups together, about: half are shared out by energy, the others by size.
+    least : int
+        Of each group.
+    rng : Generator
+
+    Returns
+    -------
+    chosen : (k,) int64
+        Ascending; all of the group, once each, if it has no more.
+    weights : (k,) float64
+        How many elements each stands for.
     """
-    m = len(energy)
-    if count >= m:
-        return np.arange(m), np.ones(m)
-    bright = energy / energy.sum() if energy.any() else np.full(m, 1 / m)
-    chance = (1 / m + bright) / 2
-    chosen = np.sort(rng.choice(m, count, p=chance / chance.sum()))
-    return chosen, 1 / (count * chance[chosen])
+    own = energy[group].astype(np.float64)
+    total, size = max(float(energy.sum(dtype=np.float64)), 1e-300), len(own)
+    count = max(least, round(count * (size / len(energy) + own.sum() / total) / 2))
+    if count >= size:
+        return np.arange(group.start, group.stop), np.ones(size)
+    bright = own / own.sum() if own.any() else np.full(size, 1 / size)
+    chance = (1 / size + bright) / 2
+    chosen = np.sort(rng.choice(size, count, p=chance / chance.sum()))
+    return group.start + chosen, 1 / (count * chance[chosen])

@@ -29,7 +29,7 @@ from mi_sparse_prt.estimation.element_sampling import (
     for_direct_light,
     for_indirect_light,
 )
-from mi_sparse_prt.operators.operator import Ids, Operator
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import FEW_MESHES
@@ -261,7 +261,8 @@ class _Estimator:
 
     def _specular(self, rng: np.random.Generator, part: float) -> Samples:
         """Light by way of mirrors and glass: whole rows, against two independent estimates of these."""
-        draws = [self._specular_rows(mesh.vertices, part, rng) for mesh in self._transport.meshes]
+        energy, count = self._specular_energy, round(part * self._effort.specular)
+        draws = [draw_by_energy(energy, mesh.vertices, count, 1, rng) for mesh in self._transport.meshes]
         ids, weights = (np.concatenate(drawn) for drawn in zip(*draws, strict=True))
         once = SpecularOptions(self._effort.specular_strata, self._effort.specular_strata)
         ours = self._transport.operators["specular"].rows(ids).astype(np.float64)
@@ -278,14 +279,6 @@ class _Estimator:
             (mesh.name, "specular"): Sample(*one)
             for mesh, one in zip(self._transport.meshes, parts, strict=True)
         }
-
-    def _specular_rows(self, mesh: slice, part: float, rng: np.random.Generator) -> tuple[Ids, Doubles]:
-        """Some rows of a mesh, and how many each stands for."""
-        own, size = self._specular_energy[mesh], mesh.stop - mesh.start
-        even, bright = size / len(self._specular_energy), own.sum() / max(self._specular_energy.sum(), 1e-300)
-        count = max(1, round(part * self._effort.specular * (even + bright) / 2))
-        chosen, weights = draw_by_energy(own, count, rng)
-        return mesh.start + chosen, weights
 
     @cached_property
     def _specular_energy(self) -> Doubles:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.element_sampling import draw_by_energy
 from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
-from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
@@ -33,39 +32,34 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     stream = random_stream(seed, HELD_OUT)
     rng, seeds = np.random.default_rng(stream), element_seeds(stream, 4)
     albedo = problem.reflection.albedo.astype(np.float64)
-    groups, energy = transport.measurement.groups, _energy(transport, albedo)
-    drawn = [_drawn(energy, group.vertices, rng) for group in groups]
-    points, lamps, weights = (np.concatenate(part) for part in zip(*drawn, strict=True))
-    asked = points, lamps  # those of all groups at once: each evaluation starts dozens of kernels
+    groups, energy, m = transport.measurement.groups, _energy(transport, albedo), problem.emission.size
+    places = [slice(group.vertices.start * m, group.vertices.stop * m) for group in groups]
+    drawn = [draw_by_energy(energy.ravel(), place, ELEMENTS, LEAST, rng) for place in places]
+    elements, weights = (np.concatenate(part) for part in zip(*drawn, strict=True))
+    asked = (
+        elements // m,
+        elements % m,
+    )  # those of all groups at once: each evaluation starts dozens of kernels
     ours = transport.incident.elements(*asked).astype(np.float64)
     seen = "direct" in transport.operators
     x, y = (_true(problem, asked, seen, *pair) for pair in (seeds[:2], seeds[2:]))
-    power = albedo[points] ** 2
+    power = albedo[asked[0]] ** 2
     sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x.light, ours - y.light), (x.all, y.all)))
     columns = weights, *(column[:, None] for column in sums)
-    ends = np.cumsum([len(one) for one, _, _ in drawn])[:-1]
+    ends = np.cumsum([len(one) for one, _ in drawn])[:-1]
     parts = zip(*(np.split(column, ends) for column in columns), strict=True)
     return estimate_errors(
         {(group.name, "all"): Sample(*part) for group, part in zip(groups, parts, strict=True)}
     )
 
 
-def _energy(transport: LightTransport, albedo: Doubles) -> Doubles:
+def _energy(transport: LightTransport, albedo: Doubles) -> NDArray[np.float32]:
     """What vertices send on of each lamp, squared, as the matrix has it (n, m)."""
-    energy = np.empty((len(albedo), transport.incident.shape[1]), np.float64)
+    energy = np.empty((len(albedo), transport.incident.shape[1]), np.float32)
     for a in range(0, len(albedo), BLOCK):
         ids = np.arange(a, min(a + BLOCK, len(albedo)))
         energy[ids] = np.square(transport.incident.rows(ids) * albedo[ids, None]).sum(axis=2)
     return energy
-
-
-def _drawn(energy: Doubles, group: slice, rng: np.random.Generator) -> tuple[Ids, Ids, Doubles]:
-    """Points, lamps and weights of elements of a group."""
-    own, m = energy[group].ravel(), energy.shape[1]
-    even, bright = len(own) / energy.size, own.sum() / max(energy.sum(), 1e-300)
-    count = max(LEAST, round(ELEMENTS * (even + bright) / 2))
-    chosen, weights = draw_by_energy(own, count, rng)
-    return group.start + chosen // m, chosen % m, weights
 
 
 class _True(NamedTuple):

@@ -42,7 +42,7 @@ def gathered_lamps(
         Whether direct light is part of the result; without, it is what surfaces reflect of it.
     """
     sources = problem.at_vertices
-    direct, arriving = _direct(problem, run, strata)
+    direct, counts = _direct(problem, run, strata)
     own = direct if sources is problem else _direct(sources, run, strata)[0]
     indirect, traced = None, 0
     if problem.max_depth != 2:
@@ -54,7 +54,7 @@ def gathered_lamps(
             if sources is not problem:
                 indirect = _seen_from(problem, own + indirect, rays, run.seed)
                 traced += len(problem.points) * rays
-    counts = {"direct": direct[..., 0].size * strata**2, "specular": arriving, "gather": traced}
+    counts["gather"] = traced
     return _result(direct if seen else None, None if indirect is None else Dense(indirect), counts)
 
 
@@ -67,10 +67,10 @@ def path_traced_lamps(
     and meet them as well. See ``gathered_lamps``.
     """
     n, m = len(problem.points), problem.emission.size
-    direct, indirect, rays = None, None, {}
+    direct, indirect = None, None
+    rays: dict[str, int] = {}
     if seen:
-        direct, arriving = _direct(problem, run, strata)
-        rays = {"direct": n * m * strata**2, "specular": arriving}
+        direct, rays = _direct(problem, run, strata)
     if problem.max_depth != 2:
         with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
             asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
@@ -85,20 +85,20 @@ def path_traced_lamps(
     return _result(direct, indirect, rays)
 
 
-def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, int]:
-    """Unit-albedo light (n, m, 3) that no diffuse surface sent on; how many rays looked for it in mirrors and glass."""
+def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, dict[str, int]]:
+    """Unit-albedo light (n, m, 3) that no diffuse surface sent on, and how many rays of each kind found it."""
     solver = LampRays(problem, strata, run.seed)
     with run.clock.phase("direct"):
         result = np.empty((len(problem.points), problem.emission.size, 3), np.float32)
         for ids in _blocks(len(result), BLOCK, "direct", run):
             result[ids] = solver.rows(ids)
     if not problem.scene.bends_light or problem.max_depth == 2:
-        return result, 0
+        return result, {"direct": solver.rays, "specular": 0}
     with run.clock.phase("specular"):
         found = specular_light(problem, run.seed, SpecularOptions(error=NOISE))
     for channel in range(3):
         result[..., channel] += found.matrices[channel % len(found.matrices)].toarray()
-    return result, found.rays
+    return result, {"direct": solver.rays, "specular": found.rays}
 
 
 def _seen_from(problem: Problem, light: Floats, rays: int, seed: int) -> Floats:

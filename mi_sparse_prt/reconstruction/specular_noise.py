@@ -61,10 +61,10 @@ class SpecularNoise:
         for channel, pair in enumerate(zip(*halves, strict=True)):
             a, b = (multiply_sparse(half, columns) for half in pair)
             smooth_a, smooth_b = (multiply_sparse(self._near, x) for x in (a, b))
-            noise, own = _apart(a, b), power[:, channel : channel + 1] / SUMS
-            error = (_apart(smooth_a, b) + _apart(smooth_b, a)) / 2
+            noise, own = _squared_distances(a, b), power[:, channel : channel + 1] / SUMS
+            error = (_squared_distances(smooth_a, b) + _squared_distances(smooth_b, a)) / 2
             before += own * noise / 4
-            after += own * (error - noise / 2 - _apart(smooth_a, smooth_b) / 4)
+            after += own * (error - noise / 2 - _squared_distances(smooth_a, smooth_b) / 4)
         pooled = [self._smoothing.pooled(x.astype(np.float32)) for x in (before, after)]
         chosen = pooled[1] < pooled[0]
         self._share = self._smoothing.pooled(chosen.astype(np.float32))
@@ -83,15 +83,15 @@ class SpecularNoise:
         return scipy.sparse.csr_array((kept + given).astype(np.float32) @ light)
 
 
-def _apart(x: Floats, y: Floats) -> NDArray[np.float64]:
-    """Squared distances of rows (n, 1)."""
+def _squared_distances(x: Floats, y: Floats) -> NDArray[np.float64]:
+    """Between rows of the same numbers (n, 1)."""
     squares = np.empty((len(x), 1))
-    run_in_parts(_add_squares, len(x), x, y, squares)
+    run_in_parts(_fill_distances, len(x), x, y, squares)
     return squares
 
 
 @numba.njit(nogil=True, cache=True)
-def _add_squares(first: int, last: int, x: Floats, y: Floats, squares: NDArray[np.float64]) -> None:
+def _fill_distances(first: int, last: int, x: Floats, y: Floats, squares: NDArray[np.float64]) -> None:
     for i in range(first, last):
         total = 0.0
         for k in range(x.shape[1]):

@@ -22,7 +22,9 @@ from mi_sparse_prt.solvers.problem import Problem
 LANES = 1 << 22  # rays per wavefront
 SHARED_OUT = 9  # spawn key
 DIRECT = 12  # spawn key
-SELDOM = 0.5  # a ray of the surface counts more than shadow rays of its direction, though these are many more
+SELDOM = (
+    0.5  # a cosine-distributed ray counts more than shadow rays of its direction, though these are many more
+)
 PILOT = 4  # for so many paths, one more tells how many an element needs
 MOST = 256  # times as many paths as others may an element have
 
@@ -30,22 +32,27 @@ Floats = NDArray[np.float32]
 
 
 class LampRays:
-    """Unit-albedo direct light of lamps at points, by shadow rays to samples of them and a few rays that may meet them.
+    """Unit-albedo direct light of lamps at points: multiple importance sampling of lamps and of the cosine.
 
     Parameters
     ----------
     problem : Problem
         Whose emission space is sampled.
     strata : int
-        Per axis of a lamp: strata**2 shadow rays per element, each at a random place of its stratum. Of the surface,
-        ``strata`` rays go out to look for lamps that are near, and as many more, strata**2 where one is.
+        Per axis of a lamp: strata**2 shadow rays per element, each at a random place of its stratum. Besides,
+        ``strata`` cosine-distributed rays look for lamps that are near; as many others count, strata**2 where one is.
     seed : int
+
+    Attributes
+    ----------
+    rays : int
+        That were traced.
     """
 
     def __init__(self, problem: Problem, strata: int = 16, seed: int = 0) -> None:
         self._emission: SampledEmission = problem.emission
         self._scene, self._strata, self._seed = problem.scene, strata, seed
-        self._max_depth = problem.max_depth
+        self._max_depth, self.rays = problem.max_depth, 0
         self._points = PointArrays(problem.points)
 
     def elements(
@@ -55,30 +62,32 @@ class LampRays:
         n, stream = len(point_ids), random_stream(self._seed if seed is None else seed, DIRECT)
         looking, *seeds = element_seeds(stream, 3)
         mean, variance = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-        counts = self._surface_counts(point_ids, columns, looking)
+        counts = self._cosine_ray_counts(point_ids, columns, looking)
         for count in np.unique(counts).tolist():
             those, size = np.flatnonzero(counts == count), max(1, LANES // (self._strata**2 + count))
             for a in range(0, len(those), size):
                 some = those[a : a + size]
                 asked = on_device(mi.UInt32, point_ids[some]), on_device(mi.UInt32, columns[some])
-                kinds = [(self._shadow_rays, self._strata**2), (self._rays_of_the_surface, count)]
+                kinds = [(self._shadow_rays, self._strata**2), (self._cosine_rays, count)]
+                self.rays += len(some) * (self._strata**2 + count)
                 for (samples, rays), own in zip(kinds[: 2 if count else 1], seeds, strict=False):
                     found = _moments(samples(*asked, count, own), rays)
                     mean[some] += found.mean[:, :3]
                     variance[some] += found.variance[:, :3]
         return Estimate(mean, variance)
 
-    def _surface_counts(
+    def _cosine_ray_counts(
         self, point_ids: NDArray[np.integer], columns: NDArray[np.integer], seed: int
     ) -> NDArray[np.int64]:
-        """How many rays of the surface each element has (m,): many where shadow rays alone would be noisy, if any."""
+        """Cosine-distributed rays of each element (m,): many where shadow rays alone would be noisy, if any."""
         if len(self._emission.unmet) == self._emission.size:
             return np.zeros(len(point_ids), np.int64)
         counts, size = np.full(len(point_ids), self._strata), LANES // self._strata
+        self.rays += int(counts.sum())
         for a in range(0, len(counts), size):
             part = slice(a, a + size)
             asked = on_device(mi.UInt32, point_ids[part]), on_device(mi.UInt32, columns[part])
-            found = _moments(self._rays_of_the_surface(*asked, self._strata, seed), self._strata)
+            found = _moments(self._cosine_rays(*asked, self._strata, seed), self._strata)
             seldom, whole = found.mean[:, 3:].T
             # more noise would be left in it than in what shadow rays find
             counts[part][seldom * self._strata > whole] = self._strata**2
@@ -91,7 +100,7 @@ class LampRays:
         return found.mean.reshape(len(point_ids), m, 3)
 
     def _shadow_rays(self, points: mi.UInt32, lamps: mi.UInt32, others: int, seed: int) -> list[mi.Float]:
-        """One value per channel and ray, rays of an element side by side; it has so many others, of the surface."""
+        """One value per channel and ray, rays of an element side by side; it has so many cosine-distributed others."""
         point, lamp, stratum, rng = self._lanes(points, lamps, self._strata**2, seed)
         row = stratum // self._strata
         uv = mi.Point2f(
@@ -107,13 +116,11 @@ class LampRays:
         lamp_at = origin + direction * (distance * self._scene.scale)
         ray = ray_to(start_ray(self._points, point, direction), lamp_at)
         value = dr.select(lit, irradiance * (cosine * dr.inv_pi), 0) * self._arriving(ray, lamp_at, lit)
-        value *= dr.select(density > 0, 1 - self._of_the_surface(cosine, density, others), 1)
+        value *= dr.select(density > 0, 1 - self._cosine_weight(cosine, density, others), 1)
         return [value.x, value.y, value.z]
 
     @dr.syntax
-    def _rays_of_the_surface(
-        self, points: mi.UInt32, lamps: mi.UInt32, rays: int, seed: int
-    ) -> list[mi.Float]:
+    def _cosine_rays(self, points: mi.UInt32, lamps: mi.UInt32, rays: int, seed: int) -> list[mi.Float]:
         """The same by cosine-distributed rays: next to a lamp a few places of it send nearly all light.
 
         Two more values tell how bright the light is that shadow rays would seldom find, and all of it.
@@ -132,7 +139,7 @@ class LampRays:
             from_world.o = self._scene.to_world(self._origin(point))
             found = active & (met == mi.Int32(lamp))
             density = emission.density(there, from_world, found)
-            part = dr.select(found & (density > 0), self._of_the_surface(local.z, density, rays), 0)
+            part = dr.select(found & (density > 0), self._cosine_weight(local.z, density, rays), 0)
             value += dr.select(part > 0, share * radiance * part, 0)
             bright = dr.select(found, dr.max(share * radiance), 0)
             whole += bright
@@ -159,8 +166,8 @@ class LampRays:
         point, lamp = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, lamps, element)
         return point, lamp, stratum, random_generator(self._points.key(point), lamp, stratum, seed)
 
-    def _of_the_surface(self, cosine: mi.Float, density: mi.Float, rays: int) -> mi.Float:
-        """How much a direction counts among rays of the surface.
+    def _cosine_weight(self, cosine: mi.Float, density: mi.Float, rays: int) -> mi.Float:
+        """How much a direction counts among cosine-distributed rays.
 
         By the power heuristic (Veach 1997, 9.2.4): shadow rays are stratified better, and tell nearly all where they
         are many.

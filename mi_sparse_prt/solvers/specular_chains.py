@@ -136,6 +136,7 @@ def _draw(
     rays: NDArray[np.float64],
     drawn: NDArray[np.bool_],
 ) -> None:
+    """Whether cells are drawn: their place in Bayer's matrix, turned by their point's number, is below their chance."""
     for i in range(first, last):
         at = own[rows[i]] + bayer[numbers[i]]
         drawn[i] = (at - 1 if at >= 1 else at) < rays[i]

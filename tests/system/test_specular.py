@@ -9,7 +9,7 @@ from conftest import T, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.estimation.element_sampling import Effort
+from mi_sparse_prt.estimation.element_sampling import Effort, draw_by_energy
 from mi_sparse_prt.estimation.held_out import _Estimator, held_out_error
 from mi_sparse_prt.measurement.pixels import camera_pixels
 from mi_sparse_prt.methods.execution import matrix_of
@@ -567,7 +567,7 @@ def test_few_rows_stand_for_all():
     for _ in range(600):
         sums = np.zeros(2)
         for mesh in transport.meshes:
-            ids, weights = estimator._specular_rows(mesh.vertices, 1.0, rng)
+            ids, weights = draw_by_energy(energy, mesh.vertices, effort.specular, 1, rng)
             assert len(ids) and ids.min() >= mesh.vertices.start and ids.max() < mesh.vertices.stop
             sums += weights.sum(), weights @ energy[ids]
         found.append(sums / (scene.n_vertices, energy.sum()))

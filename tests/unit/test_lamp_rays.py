@@ -55,19 +55,23 @@ def test_lamps_next_to_a_surface_light_it_without_much_noise(gap):
 
 
 def test_few_elements_stand_for_all():
-    """Rationale: those drawn by energy must add up to all of any other quantity, too. 4000 draws of 32 out of 500."""
+    """Rationale: those drawn by energy must add up to all of any other quantity, too. 4000 draws of about 32 of 500."""
     rng = np.random.default_rng(5)
     energy, other = rng.exponential(1, 500) ** 3, rng.normal(2, 1, 500)
+    groups = slice(0, 180), slice(180, 500)
     sums = []
     for _ in range(4000):
-        chosen, weights = draw_by_energy(energy, 32, rng)
+        drawn = [draw_by_energy(energy, group, 32, 2, rng) for group in groups]
+        chosen, weights = (np.concatenate(part) for part in zip(*drawn, strict=True))
         sums.append([weights.sum(), weights @ energy[chosen], weights @ other[chosen]])
+    assert 31 <= len(chosen) <= 33
     truth = np.array([500, energy.sum(), other.sum()])
     error = np.std(sums, axis=0, ddof=1) / np.sqrt(len(sums))
     assert (error < 0.005 * truth).all()
     assert (np.abs(np.mean(sums, axis=0) - truth) < 4 * error).all()
-    chosen, weights = draw_by_energy(energy, 500, rng)
-    assert len(chosen) == 500 and (weights == 1).all()
+    chosen, weights = draw_by_energy(energy, slice(100, 500), 1000, 2, rng)
+    np.testing.assert_array_equal(chosen, np.arange(100, 500))
+    assert (weights == 1).all()
 
 
 def test_the_error_of_a_matrix_of_lamps_next_to_surfaces_is_told():
