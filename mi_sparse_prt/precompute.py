@@ -250,7 +250,7 @@ class _Attempts:
             return self._finished(attempts, -1), plans[-1]
         judged: list[HeldOutError | None] = [None] * len(before)
         while True:
-            found = self._judged(attempts[-1], len(attempts), target)
+            found = proposals.weighed(self._judged(attempts[-1], len(attempts), target))
             judged.append(found)
             if found.total <= target or found.dark:
                 break

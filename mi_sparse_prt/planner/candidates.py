@@ -21,6 +21,7 @@ from mi_sparse_prt.planner.choice import (
     learned,
     predictions,
     uncertain,
+    weighed,
     with_direct,
 )
 
@@ -76,6 +77,10 @@ class RefinementSchedule:
                 return False
         self.plan, self._started, self._error = self._others.pop(0), elapsed, found.total
         return True
+
+    def weighed(self, found: HeldOutError) -> HeldOutError:
+        """The error of the present plan: what was found, as nothing was predicted."""
+        return found
 
     def report(self) -> list[dict[str, Any]]:
         """Plans that were compared."""
@@ -177,6 +182,10 @@ class CandidatePlans:
         self._plans.append(next_one)
         self._tried.append(next_one)
         return True
+
+    def weighed(self, found: HeldOutError) -> HeldOutError:
+        """The error of the present plan, as far as it is known: see ``choice.weighed``."""
+        return weighed(found, self._best)
 
     def report(self) -> list[dict[str, Any]]:
         """Plans that were compared, the quickest first; those that were carried out are the chosen ones."""

@@ -40,7 +40,7 @@ class SpecularSteps:
         if problem.scene.bends_light and problem.at_vertices is problem:
             averaging = SpecularNoise(problem, seed)
         self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
-        self._search.refine(AS_SOURCE * self._aim)
+        self._search.refine(AS_SOURCE * self._aim, self._own or 0.0)
         self._terms = term_rows(problem, seed) if problem.reflection.terms else None
 
     @property

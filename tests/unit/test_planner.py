@@ -31,6 +31,7 @@ from mi_sparse_prt.planner.choice import (
     learned,
     predictions,
     uncertain,
+    weighed,
     with_direct,
 )
 from mi_sparse_prt.planner.direct_costs import PATCH, DirectCost, consensus_cost
@@ -112,7 +113,8 @@ def test_the_fewest_rays_that_meet_the_target():
     assert found.error == pytest.approx(math.hypot(0.012, 0.02))
     assert found.seconds == pytest.approx(4 + 2.56)
     # together they miss what each alone would meet
-    assert best(costs, 0.0232).plan == Plan("exact", "gather", *GATHER[1])
+    quicker = Costs(0, BOTH | {"exact": DirectCost(8.0, 0.0)}, PATHS, FakeGather())
+    assert best(quicker, 0.0232).plan == Plan("exact", "gather", *GATHER[1])
 
 
 def test_the_quickest_of_the_most_exact_if_none_is_good_enough():
@@ -323,21 +325,21 @@ def test_a_rank_grows_as_it_did_within_the_sample():
 def test_what_may_miss_the_target_costs_more():
     """
     Rationale: held-out elements judge by the quarter until there is no doubt; after a miss another plan follows.
-    Expected: of 64, 256, 1024 rays at 4, 2 and 1% against 2.2%, the second is one standard deviation of predictions
-        (10%) below the target. It is judged by one to four quarters of the elements, 2.28 to be expected, and a plan
-        that certainly meets it follows with a probability of 17%. It is chosen unless the third takes less time.
+    Expected: of 64, 256, 1024 rays at 4, 2 and 1% against 2.37%, the second is nearly one standard deviation of
+        predictions (18%) below the target. It is judged by one to four quarters of the elements, 1.7 to be expected,
+        and a plan that certainly meets it follows with a probability of 17%. It is chosen unless the third takes less time.
     """
-    costs = Costs(1.0, EXACT, PATHS, FakeGather(), check=4.0)
-    gathering = {p.plan.rays: p for p in predictions(costs, 0.022) if p.plan.indirect == "gather"}
-    off = math.log(2.2 / 2) + 0.1 * np.random.default_rng(0).standard_normal(10**6)
+    costs, target = Costs(1.0, EXACT, PATHS, FakeGather(), check=4.0), 0.02 * math.exp(0.17)
+    gathering = {p.plan.rays: p for p in predictions(costs, target) if p.plan.indirect == "gather"}
+    off = 0.17 + 0.18 * np.random.default_rng(0).standard_normal(10**6)
     judged = np.clip((2 * 0.07 / off) ** 2, 1, 4).mean()
-    assert judged == pytest.approx(2.28, abs=0.1)
+    assert judged == pytest.approx(1.7, abs=0.1)
     seconds = {rays: p.seconds for rays, p in gathering.items()}
     assert seconds == pytest.approx({64: 11.64, 256: 12.56 + judged, 1024: 21.24, 4096: 51.96}, abs=0.05)
     risks = {rays: p.risk for rays, p in gathering.items()}
-    assert risks == pytest.approx({64: 10.24, 256: 0.17 * 10.24, 1024: 0.0, 4096: 0.0}, rel=0.01, abs=1e-3)
-    assert best(costs, 0.022).plan.rays == 256
-    assert best(replace(costs, check=25.0), 0.022).plan.rays == 1024
+    assert risks == pytest.approx({64: 10.24, 256: 0.1725 * 10.24, 1024: 0.0, 4096: 0.0}, rel=0.01, abs=1e-3)
+    assert best(costs, target).plan.rays == 256
+    assert best(replace(costs, check=50.0), target).plan.rays == 1024
 
 
 def test_direct_light_that_the_choice_depends_on_is_found_first():
@@ -692,8 +694,8 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
 def test_noise_of_specular_light_alone(monkeypatch):
     """
     Scenario: ``specular_error`` is given; half of the error of all is noise of specular light.
-    Expected: that noise is no part of the error that the target is for, before or after; in the end it is as was asked,
-        or as little as matters beside other errors.
+    Expected: that noise is no part of the error that the target is for, before or after; from the beginning it is as
+        was asked, or as little as matters beside other errors.
     """
     asked = []
 
@@ -718,7 +720,7 @@ def test_noise_of_specular_light_alone(monkeypatch):
     )
     assert steps.foreseen(found).total == pytest.approx(0.03)
     steps.refine(found)
-    assert asked[0] == (pytest.approx(2 * 0.02 / math.sqrt(2)), 0)
+    assert asked[0] == (pytest.approx(2 * 0.02 / math.sqrt(2)), 0.1)
     assert asked[1] == (pytest.approx(0.03 * math.sqrt(1 / 0.81 - 1), rel=0.01), 0.1)
     assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
     with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
@@ -783,3 +785,28 @@ def test_plans_in_turn_end_where_rays_do_not_help():
     assert not turns.after(found(0.01, 0.03), 40.0)  # 4 x 30 s more
     assert not RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, of_rays=0.04)  # 0.092 at best
     assert RefinementSchedule(plans).after(found(0.01, 0.1), 4.0, of_rays=0.06)
+
+
+def test_an_error_that_is_hardly_known_is_weighed_against_the_prediction():
+    """
+    Rationale: of a caustic, a few held-out elements hold most of the squared error; predictions are within 18%, and
+        one in ten is off by a factor of two.
+    Expected: what is known within 1% stays as it was found. What has a standard error as large as the prediction's own
+        lies between the two, more so if less is known; but where they contradict each other, what was found counts.
+        Squares of parts add up to that of the total, and direct light keeps its own.
+    """
+    predicted = Predicted(Plan("exact", "gather", 64, 0.1), 1.0, 0.015)
+
+    def after(error: float, standard_error: float) -> HeldOutError:
+        parts = {"direct": 0.01, "indirect": math.sqrt(error**2 - 0.01**2)}
+        found = weighed(HeldOutError(error, {}, {"total": standard_error}, 100, parts, []), predicted)
+        assert math.hypot(*found.parts.values()) == pytest.approx(found.total)
+        assert found.parts["direct"] == 0.01
+        return found
+
+    assert after(0.02, 0.0002).total == pytest.approx(0.02, rel=0.01)
+    assert after(0.02, 0.0).total == pytest.approx(0.02, rel=0.01)
+    assert after(0.02, 0.18 * 0.015).total == pytest.approx(0.0175, rel=0.06)
+    assert after(0.03, 0.03).total == pytest.approx(0.0155, rel=0.06)
+    assert after(0.06, 0.008).total == pytest.approx(0.055, rel=0.1)
+    assert after(1.0, 0.01).total == pytest.approx(1.0)  # beyond all that a prediction allows for
