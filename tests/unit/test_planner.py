@@ -327,7 +327,8 @@ def test_what_may_miss_the_target_costs_more():
     Rationale: held-out elements judge by the quarter until there is no doubt; after a miss another plan follows.
     Expected: of 64, 256, 1024 rays at 4, 2 and 1% against 2.37%, the second is nearly one standard deviation of
         predictions (18%) below the target. It is judged by one to four quarters of the elements, 1.7 to be expected,
-        and a plan that certainly meets it follows with a probability of 17%. It is chosen unless the third takes less time.
+        and a plan that certainly meets it follows with a probability of 17%. It is chosen unless the third takes less
+        time.
     """
     costs, target = Costs(1.0, EXACT, PATHS, FakeGather(), check=4.0), 0.02 * math.exp(0.17)
     gathering = {p.plan.rays: p for p in predictions(costs, target) if p.plan.indirect == "gather"}
