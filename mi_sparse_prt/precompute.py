@@ -233,7 +233,7 @@ class _Attempts:
         proposals = self._proposals
         if isinstance(proposals, RefinementSchedule) or (how := proposals.uncertain) is None:
             return []
-        parts = self._execution.direct_light(how)
+        parts = self._execution.direct_light(Plan(how))
         proposals.choose_again(how, self._judged(parts, 0, None, indirect=False).total)
         return [parts]
 

@@ -27,6 +27,7 @@ from mi_sparse_prt.reconstruction.gather_noise import GatherNoise
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.solvers.adaptive_strata import adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -37,6 +38,8 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.transport import LightTransport
+
+STRATA = 4  # per axis of a texel that is seen in part, where a plan does not say
 
 
 class Execution:
@@ -64,14 +67,14 @@ class Execution:
     ) -> None:
         self._problem, self._solver = direct.problem, direct
         self._settings, self._any_indirect, self._run = settings, indirect, run
-        self._direct: dict[str, MethodResult] = {}
+        self._direct: dict[tuple[str, int | None], MethodResult] = {}
         self._specular, self._specular_rays = specular, 0 if specular is None else specular.rays
 
     def parts(self, plan: Plan) -> MethodResult:
         """The parts of the matrix, and an account of what was evaluated for them by this call."""
         if plan.direct in TOGETHER:
             return self._with_specular(self._together(plan))
-        light = self._with_specular(self.direct_light(plan.direct))
+        light = self._with_specular(self.direct_light(plan))
         if plan.indirect == "none" or not self._any_indirect:
             return light
         return self._gathered(plan, light) if plan.indirect == "gather" else self._path_traced(plan, light)
@@ -83,8 +86,9 @@ class Execution:
         rays, self._specular_rays = self._specular_rays, 0
         return replace(light, specular=self._specular, rays=light.rays | {"specular": rays})
 
-    def direct_light(self, how: str) -> MethodResult:
-        """Direct light alone; it costs nothing the second time."""
+    def direct_light(self, plan: Plan) -> MethodResult:
+        """Direct light of a plan alone; it costs nothing the second time."""
+        how = plan.direct, plan.strata
         if how in self._direct:
             return replace(
                 self._direct[how],
@@ -92,9 +96,18 @@ class Execution:
                 elements={"direct": 0, "indirect": 0},
                 rays={"direct": 0},
             )
-        find = {"exact": self._exact, "edges": self._edges, "consensus": self._consensus}[how]
-        self._direct[how] = self._with_terms(find())
+        self._direct[how] = self._with_terms(self._found_directly(plan))
         return self._direct[how]
+
+    def _found_directly(self, plan: Plan) -> MethodResult:
+        match plan.direct:
+            case "exact":
+                return self._exact()
+            case "edges":
+                return self._edges()
+            case "adaptive":
+                return self._adaptive(plan.strata or STRATA)
+        return self._consensus()
 
     def _with_terms(self, light: MethodResult) -> MethodResult:
         """Direct light with rows for the terms of glossy vertices; they see what their vertices see."""
@@ -126,6 +139,13 @@ class Execution:
         with self._run.clock.phase("edges"):
             part, rays = fractional_visibility(solver, centres.direct.bits)
         return replace(centres, direct=part, rays={"direct": centres.rays["direct"] + rays})
+
+    def _adaptive(self, strata: int) -> MethodResult:
+        """Strata of all texels, more of those that are seen in part."""
+        elements = len(self._solver.points) * self._solver.lighting.n_directions
+        with self._run.clock.phase("direct"):
+            part, rays = adaptive_visibility(self._problem, strata, self._run.seed)
+        return MethodResult(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
 
     def _centres(self, solver: DirectSolver) -> MethodResult:
         """Which texels' centres are seen; rays that looked for light that surfaces let through may know."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from mi_sparse_prt.core.errors import PrtError
 
-DIRECT = ("exact", "consensus", "edges", "sparse", "huang2010")
+DIRECT = ("exact", "consensus", "edges", "adaptive", "sparse", "huang2010")
 INDIRECT = ("none", "gather", "sparse", "paths", "huang2010")
 TOGETHER = ("sparse", "huang2010")  # evaluate both parts at the same elements
 PARAMETERS = {
@@ -25,11 +25,12 @@ class Plan:
 
     Parameters
     ----------
-    direct : {"exact", "consensus", "edges", "sparse", "huang2010"}
+    direct : {"exact", "consensus", "edges", "adaptive", "sparse", "huang2010"}
         Rays for every element above the horizon; rays where neighbouring vertices disagree
         (``methods.consensus_visibility``); a ray for every texel's centre, and more along edges of visibility
-        (``solvers.texel_edges``); or as the method of that name does. ``"exact"`` is for both bases, ``"edges"``
-        for the texel basis, the others are for the direction basis.
+        (``solvers.texel_edges``); four rays in every texel, and more where these disagree
+        (``solvers.adaptive_strata``); or as the method of that name does. ``"exact"`` is for both bases, ``"edges"``
+        and ``"adaptive"`` for the texel basis, the others are for the direction basis.
     indirect : {"none", "gather", "sparse", "paths", "huang2010"}
         Left out; finite elements; or paths, for the elements of a method or for all. Light that cannot be there is
         left out under any plan.
@@ -42,6 +43,8 @@ class Plan:
     resolution, spp : int, optional
         Of ``"paths"``: texels along an edge of the indirect light's cubemap, and paths per element (also of
         ``"sparse"`` and ``"huang2010"``). If not given, those of ``precompute``.
+    strata : int, optional
+        Of ``"adaptive"``: rays per axis in texels that are seen in part, 4 if not given.
 
     Raises
     ------
@@ -57,6 +60,7 @@ class Plan:
     dense: float | None = None
     resolution: int | None = None
     spp: int | None = None
+    strata: int | None = None
 
     def __post_init__(self) -> None:
         for what, value, known in (
@@ -68,13 +72,14 @@ class Plan:
         if (self.direct in TOGETHER or self.indirect in TOGETHER) and self.direct != self.indirect:
             raise PrtError(
                 f"plan: {self.direct!r} direct light does not go with {self.indirect!r} indirect light; "
-                'combine "exact", "consensus" or "edges" with "none", "gather" or "paths"'
+                'combine "exact", "consensus", "edges" or "adaptive" with "none", "gather" or "paths"'
             )
 
     @property
     def parameters(self) -> dict[str, Any]:
         """Those that this plan depends on."""
-        return {name: getattr(self, name) for name in PARAMETERS[self.indirect]}
+        names = PARAMETERS[self.indirect] + (("strata",) if self.direct == "adaptive" else ())
+        return {name: getattr(self, name) for name in names}
 
     def report(self) -> dict[str, Any]:
         """As JSON has it."""

@@ -127,7 +127,7 @@ class Settings:
 
     def _check_plan(self, plan: Plan) -> None:
         name = self._name
-        basis = {"exact": self.basis, "edges": "texel"}.get(plan.direct, "direction")
+        basis = {"exact": self.basis, "edges": "texel", "adaptive": "texel"}.get(plan.direct, "direction")
         if self.basis != basis:
             raise PrtError(f'method {name!r} works in the {basis} basis; set basis="{basis}"')
         if plan.indirect != "paths" and self.indirect_resolution not in (None, self.resolution):

@@ -143,7 +143,9 @@ def _plans(costs: Costs, target: float, spp: int | None) -> Iterator[_Priced]:
         others = math.hypot(light.error, costs.specular)
         room = math.sqrt(max((MARGIN * target) ** 2 - others**2, 0.0))
         for plan, seconds, error in _indirect(costs, name, room, spp):
-            yield _Priced(plan, light.seconds, seconds, math.hypot(others, error))
+            yield _Priced(
+                replace(plan, strata=light.strata), light.seconds, seconds, math.hypot(others, error)
+            )
     if costs.sparse is not None:
         for share in DENSE:
             plan = Plan("sparse", "sparse", dense=share, spp=costs.sparse.spp)
@@ -202,7 +204,7 @@ def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str
     if costs.dark:
         return None
     for name in costs.direct:
-        if name == "exact":
+        if name in ("exact", "adaptive"):
             continue
         choices = {
             choose(
@@ -279,7 +281,7 @@ def with_direct(costs: Costs, name: str, error: float) -> Costs:
     expected = costs.direct[name].error
     off = error / expected if expected > 0 else 1.0
     others = {kind: replace(light, error=off * light.error) for kind, light in costs.direct.items()}
-    return replace(costs, direct=others | {name: DirectCost(0.0, error)})
+    return replace(costs, direct=others | {name: replace(costs.direct[name], seconds=0.0, error=error)})
 
 
 def better(plans: list[Predicted], error: float, seconds: float) -> Predicted | None:

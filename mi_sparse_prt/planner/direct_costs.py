@@ -18,6 +18,7 @@ from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.adaptive_strata import ACROSS, adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.solvers.walls import Walls
@@ -34,17 +35,18 @@ OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 class DirectCost:
     """Seconds of all direct light, and its error relative to the whole matrix, L2.
 
-    ``centres`` are those seconds that rays to texels' centres take.
+    ``centres`` are those seconds that rays to texels' centres take, ``strata`` those of an adaptive plan.
     """
 
     seconds: float
     error: float
     centres: float = 0.0
+    strata: int | None = None
 
     @property
     def with_known_centres(self) -> DirectCost:
         """Where these rays have been traced for something else."""
-        return DirectCost(self.seconds - self.centres, self.error)
+        return replace(self, seconds=self.seconds - self.centres, centres=0.0)
 
 
 def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
@@ -72,6 +74,33 @@ def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     ours = part.elements(np.repeat(places, held.texels.shape[1]), held.texels.ravel())
     square = held.relative_square(held.error_of(held.direct, ours.reshape(*held.texels.shape, 1)))
     return DirectCost(centres + edges, math.sqrt(max(square, 0.0)), centres)
+
+
+def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: int) -> DirectCost:
+    """Strata of all texels, and as many of those that are seen in part as an error takes; the most, if none is enough.
+
+    The squared error is that of texels that seem to be seen as a whole, and one that falls as ``strata**-3``; seconds
+    grow as ``strata**2``. Two numbers of strata tell both.
+    """
+    count = len(held.vertices)
+    places = np.repeat(np.arange(count), held.texels.shape[1])
+    few = direct.problem.at(points_at(direct.points, held.vertices))
+    seconds, squares = [], []
+    for across in (ACROSS[0], ACROSS[-1]):
+        adaptive_visibility(few, across, seed)
+        start = time.perf_counter()
+        part, _ = adaptive_visibility(few, across, seed)
+        seconds.append((time.perf_counter() - start) * len(direct.points) / count)
+        ours = part.elements(places, held.texels.ravel()).reshape(*held.texels.shape, 1)
+        squares.append(max(held.relative_square(held.error_of(held.direct, ours)), 0.0))
+    of_error, of_seconds = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
+    fall = max(squares[0] - squares[1], 0.0) / (of_error[0] - of_error[-1])
+    errors = np.sqrt(fall * of_error + max(squares[1] - fall * of_error[-1], 0.0))
+    rise = max(seconds[1] - seconds[0], 0.0) / (of_seconds[-1] - of_seconds[0])
+    k = int(np.argmax(errors <= aim)) if errors[-1] <= aim else len(ACROSS) - 1
+    return DirectCost(
+        float(seconds[0] + rise * (of_seconds[k] - of_seconds[0])), float(errors[k]), strata=ACROSS[k]
+    )
 
 
 def points_at(points: Points, ids: NDArray[np.integer]) -> Points:

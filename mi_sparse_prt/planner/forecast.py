@@ -27,6 +27,7 @@ _DIRECT = {
     "exact": _Share(1, 0),
     "consensus": _Share(0.35, 0),
     "edges": _Share(0.5, 0),
+    "adaptive": _Share(2.0, 0),
     "sparse": _Share(0.8, 0),
     "huang2010": _Share(2.7, 0),
 }

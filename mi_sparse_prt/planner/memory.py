@@ -24,6 +24,7 @@ RANK = 5.0  # of a first bounce, times its tolerance: 3 to 11 in scenes of few a
 COMBINATIONS = 1.3  # vectors of a random basis for each of the rank, as the last of the energy takes many ...
 FIRST_COMBINATIONS = 96  # ... and so many are drawn at once
 EDGES = 4.0  # texels that a vertex sees in part, times the resolution
+IN_PART = 0.25  # of all texels, where what is seen is so fine that strata are adaptive
 ENTRY = 8  # bytes of an entry of a sparse matrix
 DENSE, HUANG_DENSE = 0.22, 0.3  # share of the vertices whose rows are known, where nothing else is asked for
 
@@ -67,6 +68,9 @@ def _direct(direct: DirectSolver, plan: Plan) -> tuple[float, float]:
     bits = n * -(-texels // 32) * 4.0
     if plan.direct == "edges":
         parts = n * EDGES * direct.lighting.resolution * 3
+        return bits + parts, bits + parts
+    if plan.direct == "adaptive":
+        parts = n * IN_PART * texels * 3
         return bits + parts, bits + parts
     if direct.basis == "texel":
         return 2.0 * n * texels, 0.0

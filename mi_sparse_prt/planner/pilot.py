@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from mi_sparse_prt.estimation.darkness import DARK
@@ -10,7 +11,7 @@ from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import MARGIN, Costs, choose, predictions
-from mi_sparse_prt.planner.direct_costs import consensus_cost, edges_cost, exact_cost
+from mi_sparse_prt.planner.direct_costs import adaptive_cost, consensus_cost, edges_cost, exact_cost
 from mi_sparse_prt.planner.path_costs import (
     COARSEST,
     coarse_resolutions,
@@ -56,6 +57,9 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
         light["consensus"] = consensus_cost(direct, held, seed)
     elif auto:
         light["edges"] = edges_cost(direct, held)
+        aim = MARGIN * (settings.target_error or TARGET) / math.sqrt(2)  # half of its square
+        if min(cost.error for cost in light.values()) > aim:
+            light["adaptive"] = adaptive_cost(direct, held, aim, seed)
     check = _check(held)
     # light by way of mirrors and glass is not among the elements
     dark = not problem.specular_apart and held.light() <= DARK

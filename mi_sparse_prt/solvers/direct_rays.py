@@ -27,6 +27,7 @@ Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, wor
 
 ALL = 0.999  # of the light: what lets as much pass is not there
 
+SHARES = 1 << 31  # a random number's use, beyond those of strata
 LANES = 1 << 24  # rays per wavefront: about 0.3 s each, so that Ctrl-C and progress bars respond
 
 
@@ -158,6 +159,51 @@ class DirectSolver:
             else:
                 cosine[part] = self.weighted_means(points, texels, lambda *_: [mi.Float(1)], seed)[0].numpy()
         return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
+
+    def shares(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.int16]:
+        """What is seen of listed texels, (n,): of their mean cosine above the horizon, 255 is all; -1 below it.
+
+        Texel basis. As far as rays in strata can tell; a lane traces those of a row of strata, one after the other.
+        """
+        found = np.zeros(len(point_ids), np.int16)
+        size = LANES // self.strata
+        for a in range(0, len(point_ids), size):
+            part = slice(a, a + size)
+            # one more: Dr.Jit would compile another kernel for arrays of size one
+            ids = (np.append(some[part], some[part][-1:]) for some in (point_ids, texel_ids))
+            seen, total = self._summed(*(on_device(mi.UInt32, some) for some in ids))
+            share = dr.select(total > 0, mi.Int32(255 * seen / total + 0.5), -1)
+            found[part] = share.numpy()[:-1]
+        return found
+
+    def _summed(self, points: mi.UInt32, texels: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """Cosines times solid angles of what is seen of texels, and of all above the horizon."""
+        across = self.strata
+        lane = dr.arange(mi.UInt32, len(texels) * across)
+        element = lane // across
+        row = lane - element * across
+        point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
+        rng = random_generator(self._points.key(point), texel, SHARES + row, self.seed)
+
+        def trace(
+            column: mi.UInt32, rng: mi.PCG32, seen: mi.Float, total: mi.Float
+        ) -> tuple[mi.UInt32, mi.PCG32, mi.Float, mi.Float]:
+            u, v = ((mi.Float(k) + rng.next_float32()) / across for k in (column, row))
+            direction, area = self._texels.inside(texel, u, v)
+            visible, cosine = self.trace(point, direction, mi.Mask(True))
+            every = dr.maximum(cosine, 0) * area
+            return column + 1, rng, seen + dr.select(visible, every, 0), total + every
+
+        # what looks through surfaces evaluates on the way
+        passes = self.problem.specular_apart and self.problem.scene.passes_straight
+        n = len(lane)
+        state = dr.zeros(mi.UInt32, n), rng, dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
+        *_, seen, total = dr.while_loop(
+            state, lambda column, *_: column < across, trace, mode="evaluated" if passes else "symbolic"
+        )
+        dr.eval(seen, total)
+        seen, total = (dr.block_reduce(dr.ReduceOp.Add, x, across) for x in (seen, total))
+        return seen, total
 
     def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Whether points see the centres of texels, (n,) bool; never below the horizon. One ray per element."""

@@ -3,6 +3,8 @@
 import json
 import warnings
 
+import mitsuba as mi
+import numpy as np
 import pytest
 from conftest import COLOURS, build, diffuse, still_life
 
@@ -127,6 +129,27 @@ def test_areas_of_texels_by_their_edges(scene):
     assert report["plan"]["direct"] == "edges"
     error = report["estimated_error"]
     assert error["total"] < 0.04 + 2 * error["standard_error"]["total"]
+
+
+def test_areas_of_texels_by_ever_more_strata():
+    """Slats that are narrower than texels: edges are 12% off, four rays 8%; the target is met all the same."""
+    slats = {
+        f"slat_{k}": {
+            "type": "rectangle",
+            "bsdf": diffuse(0.5, 0.5, 0.5),
+            "to_world": mi.ScalarTransform4f().translate([x, 0, 1]).scale([0.1, 4, 1]),
+        }
+        for k, x in enumerate(np.arange(-3, 3, 0.4))
+    }
+    scene = build(0.4, floor={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)}, **slats)
+    report = prt.precompute(
+        scene, LIGHTING, basis="texel", max_depth=2, target_error=0.03, progress=False
+    ).report
+    predicted = {plan["direct"]: plan["predicted_error"] for plan in report["plans"]}
+    assert report["plan"]["direct"] == "adaptive"
+    assert predicted["adaptive"] < 0.03 < min(predicted["edges"], predicted["exact"])
+    error = report["estimated_error"]
+    assert error["total"] < 0.03 + 2 * error["standard_error"]["total"]
 
 
 def test_given_samples_and_resolution_are_those_of_its_paths(scene):

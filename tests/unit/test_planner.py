@@ -577,7 +577,11 @@ def test_predicted_errors_are_those_of_the_matrix():
 def test_costs_of_what_is_left_open(grey_scene, indirect):
     direct = DirectSolver(problem_at(grey_scene, LIGHTING, basis="texel"))
     costs = measure(direct, Settings(4, basis="texel", indirect_resolution=2), indirect)
-    assert costs.direct.keys() == {"exact", "edges"}  # consensus and "sparse" are of the other basis
+    # consensus and "sparse" are of the other basis
+    assert costs.direct.keys() == {"exact", "edges", "adaptive"}
+    assert costs.direct["adaptive"].error < costs.direct["exact"].error / 2
+    loose = measure(direct, Settings(4, basis="texel", indirect_resolution=2, target_error=0.9), indirect)
+    assert loose.direct.keys() == {"exact", "edges"}  # these are exact enough
     assert 0 < costs.direct["edges"].error < costs.direct["exact"].error
     assert costs.sparse is None
     assert 0 < costs.direct["exact"].error < 0.2
