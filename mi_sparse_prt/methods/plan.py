@@ -69,6 +69,8 @@ class Plan:
         ):
             if value not in known:
                 raise PrtError(f"plan: unknown {what} {value!r}; choose one of: {', '.join(known)}")
+        if self.strata is not None and self.strata < 1:
+            raise PrtError(f"plan: strata is {self.strata}; it must be at least 1, or left out")
         if (self.direct in TOGETHER or self.indirect in TOGETHER) and self.direct != self.indirect:
             raise PrtError(
                 f"plan: {self.direct!r} direct light does not go with {self.indirect!r} indirect light; "

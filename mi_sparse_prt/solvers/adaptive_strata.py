@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits, pack
 from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -24,6 +25,7 @@ ALIKE = (
     FULL // 5
 )  # shares that differ by less: those of FIRST**2 rays do by more, unless the horizon weighs them
 SINGLE = 0.3 * FULL  # more than one of FIRST**2 rays can be
+ADAPTIVE = 14  # spawn key
 MISSED = 0.005  # of the light of a point, which may be where no ray has found any
 
 Shares = NDArray[np.int16]
@@ -54,7 +56,8 @@ def adaptive_visibility(problem: Problem, across: int, seed: int) -> tuple[Fract
     """
     lighting, points = problem.emission, problem.points
     size, step = lighting.n_directions, max(1, ELEMENTS // lighting.n_directions)
-    first, second = DirectSolver(problem, FIRST, seed), DirectSolver(problem, across, seed + 1)
+    seeds = element_seeds(random_stream(seed, ADAPTIVE), 2)
+    first, second = (DirectSolver(problem, *one) for one in zip((FIRST, across), seeds, strict=True))
     near = np.ascontiguousarray(np.hstack([lighting.sides.tables.beside, lighting.sides.tables.across]))
     blocks, rays = [], 0
     for a in range(0, max(len(points), 1), step):

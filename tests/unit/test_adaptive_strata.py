@@ -109,6 +109,11 @@ def test_the_same_for_any_block_of_points(monkeypatch):
     assert not np.array_equal(whole.shares, other.shares)
 
 
+def test_no_strata_are_refused():
+    with pytest.raises(prt.PrtError, match="strata is 0"):
+        Plan("adaptive", strata=0)
+
+
 def test_no_points():
     problem = floor_of(under_slats(0.6, 0.5))
     none = problem.at(Points(*(x[:0] for x in vars(problem.points).values())))
