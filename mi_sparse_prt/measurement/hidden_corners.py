@@ -7,7 +7,6 @@ just before a wall it is dark: corners there light no point beside the board.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
@@ -17,13 +16,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_sparse_prt.measurement.covered_corners import ALL, CoveredCorners, around_of, narrow_height, room
 from mi_sparse_prt.measurement.vertices import vertex_points
 from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.scene import Scene
 
 TRIANGLES = 1 << 20  # at a time
-NARROW = 1 / 16  # of the size of a triangle, its area's root: in narrower gaps light changes too fast for it
-ASIDE = 1 / 8  # of the way from a corner to the middle, where it is asked whether that is in a gap
 SHORT = 0.99  # of the way to a corner: what is met beyond hides nothing
 
 _KNOWN: WeakKeyDictionary[Scene, HiddenCorners] = WeakKeyDictionary()
@@ -60,7 +58,10 @@ class HiddenCorners:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._unit = scene.normalised, 1.0
         triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
-        self._corners = mi.Point3f(vertex_points(scene).positions[triangles.ravel()].T)
+        self._places = vertex_points(scene).positions[triangles]  # [triangle, corner, xyz]
+        self._ends = np.cumsum([0, *(len(mesh.triangles) for mesh in scene.fronts)])
+        self._two_sided = scene.backs[triangles[:, 0]] >= 0
+        self._corners = mi.Point3f(self._places.reshape(-1, 3).T)
         cut = np.zeros(len(triangles), bool)
         for a in range(0, len(triangles), TRIANGLES):
             part = slice(a, min(a + TRIANGLES, len(triangles)))
@@ -76,26 +77,30 @@ class HiddenCorners:
         ----------
         scene : Scene
         """
+        some = self._covered.some  # found now, and not while a loop is traced
         found = copy(self)
         found._scene, found._corners = scene.world, scene.to_world(self._corners)
         found._unit = 1 / scene.scale
-        vars(found).pop("_gaps", None)  # those of the other frame
-        in_gaps = bool(dr.any(found._gaps != 0))  # found now, and not while a loop is traced
-        found.some = self.some or in_gaps
+        found.some = self.some or some
         return found
 
-    def weights(
+    @cached_property
+    def _covered(self) -> CoveredCorners:
+        return CoveredCorners(self._scene, self._places, self._ends, self._two_sided)
+
+    def corners(
         self,
         triangle: mi.UInt32,
         point: mi.Point3f,
         way: mi.Vector3f,
         weights: Sequence[mi.Float],
         active: mi.Mask,
-    ) -> list[mi.Float]:
-        """Barycentric weights of points, those of hidden corners 0 where another one is seen; they add to 1.
+    ) -> tuple[mi.UInt32, list[mi.Float]]:
+        """The triangle whose corners light points, and their weights: 0 where one that is seen hides others.
 
-        Corners in a narrow gap are hidden from points that are in none, and the others from those that are in one:
-        what stands a millimetre before a wall leaves the wall dark up to its edge, not beyond.
+        Covered corners are hidden from points that are not, and the others from those that are: what stands a
+        millimetre before a wall leaves the wall dark up to its edge, not beyond. Where all corners are covered and the
+        point is not, a triangle beside stands in, if any is alike.
 
         Parameters
         ----------
@@ -104,23 +109,42 @@ class HiddenCorners:
         way : Vector3f
             Of the ray that met it there: on which side of the triangle it is.
         weights : three Float
+            Barycentric; those that are returned add to 1, too.
         active : Mask
         """
         cut = active & dr.gather(mi.Bool, self._cut, triangle, active)
-        gaps = dr.gather(mi.UInt8, self._gaps, triangle, active)
         p, normal = self._placed(triangle, active)
         front = dr.dot(normal, way) < 0
         normal = dr.select(front, normal, -normal)
         seen = [~self._hides(3 * triangle + k, point, normal, cut) for k in range(3)]
-        cut |= gaps != 0
-        inside = cut & self._is_narrow(point, normal, _height(p), cut)
-        for k in range(3):
-            corner_inside = (gaps & dr.select(front, mi.UInt8(1 << k), mi.UInt8(8 << k))) != 0
-            seen[k] &= corner_inside == inside
+        narrow, inside = self._covered.corners(triangle, front, active)
+        changed = cut | (narrow != 0) | (inside != 0)
+        covered = self._is_covered(p, point, normal, narrow != 0, inside != 0)
+        covers = narrow | inside
+        other = self._covered.beside(triangle, front, changed & ~covered & (covers == ALL))
+        replaced = changed & ~covered & (other != triangle)
+        narrow, inside = self._covered.corners(other, front, replaced)
+        covers = dr.select(replaced, narrow | inside, covers)
+        weights = [dr.select(replaced, 1 / 3, w) for w in weights]
+        seen = [(s | replaced) & (((covers & (1 << k)) != 0) == covered) for k, s in enumerate(seen)]
         none = ~(seen[0] | seen[1] | seen[2])
         kept = [dr.select(k | none, dr.maximum(w, 1e-6), 0) for k, w in zip(seen, weights, strict=True)]
         total = kept[0] + kept[1] + kept[2]
-        return [dr.select(cut, some / total, w) for some, w in zip(kept, weights, strict=True)]
+        found = [dr.select(changed, some / total, w) for some, w in zip(kept, weights, strict=True)]
+        return dr.select(replaced, other, triangle), found
+
+    def _is_covered(
+        self,
+        corners: list[mi.Point3f],
+        point: mi.Point3f,
+        normal: mi.Vector3f,
+        narrow: mi.Mask,
+        inside: mi.Mask,
+    ) -> mi.Mask:
+        """Whether points are in a narrow gap, or inside of a solid, as some corner of their triangle is."""
+        height, around = narrow_height(corners), around_of(corners)
+        way, behind = room(self._scene, self._corners, point, normal, around, self._unit, narrow | inside)
+        return (narrow & (way < height)) | (inside & behind)
 
     def choose(
         self,
@@ -182,27 +206,6 @@ class HiddenCorners:
             crossed |= (a & b) | (b & c) | (c & a)
         return crossed
 
-    @cached_property
-    def _gaps(self) -> mi.UInt8:
-        """Which corners of each triangle are in a gap that is narrow for it: three bits for the front, three behind."""
-        gaps = np.zeros(dr.width(self._corners) // 3, np.uint8)
-        for a in range(0, len(gaps), TRIANGLES):
-            p, normal = self._placed(dr.arange(mi.UInt32, a, min(a + TRIANGLES, len(gaps))), mi.Mask(True))
-            middle, height, found = (p[0] + p[1] + p[2]) / 3, _height(p), mi.UInt32(0)
-            for bit, (side, corner) in enumerate(itertools.product((normal, -normal), p)):
-                narrow = self._is_narrow(dr.lerp(corner, middle, ASIDE), side, height, mi.Mask(True))
-                found |= dr.select(narrow, mi.UInt32(1 << bit), 0)
-            gaps[a : a + TRIANGLES] = found.numpy()
-        return mi.UInt8(gaps)
-
-    def _is_narrow(
-        self, point: mi.Point3f, normal: mi.Vector3f, height: mi.Float, active: mi.Mask
-    ) -> mi.Mask:
-        """Whether there is less room than so much above points."""
-        ray = mi.Ray3f(dr.fma(normal, ray_offset(point, self._unit), point), normal)
-        ray.maxt = height
-        return self._scene.ray_test(ray, active)
-
     def _placed(self, triangle: mi.UInt32, active: mi.Mask) -> tuple[list[mi.Point3f], mi.Vector3f]:
         """The corners of triangles, and their normals."""
         p = [dr.gather(mi.Point3f, self._corners, 3 * triangle + k, active) for k in range(3)]
@@ -214,11 +217,6 @@ class HiddenCorners:
         ray = mi.Ray3f(lifted, end - start)
         ray.maxt = mi.Float(SHORT)
         return self._scene.ray_test(ray, active)
-
-
-def _height(p: Sequence[mi.Point3f]) -> mi.Float:
-    """Of gaps that are narrow for triangles, by their corners."""
-    return NARROW * dr.sqrt(dr.norm(dr.cross(p[1] - p[0], p[2] - p[0])))
 
 
 def _chosen(weights: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:

@@ -193,15 +193,15 @@ class RelitScene:
         """The vertices around each hit, on the sheet that it is on and on its side of walls; whether it has any."""
         triangle = self._scene.triangle(hit, valid)
         u, v = hit.prim_uv
+        weights = [1 - u - v, u, v]
+        if self._hidden.some:
+            triangle, weights = self._hidden.corners(triangle, si.p, ray.d, weights, valid)
         vertices = [dr.gather(mi.UInt32, corner, triangle, valid) for corner in self._corners]
         backs = [dr.gather(mi.Int32, self._backs, vertex, behind) for vertex in vertices]
         valid &= ~behind | (backs[0] >= 0)
         vertices = [
             dr.select(behind, mi.UInt32(back), vertex) for back, vertex in zip(backs, vertices, strict=True)
         ]
-        weights = [1 - u - v, u, v]
-        if self._hidden.some:
-            weights = self._hidden.weights(triangle, si.p, ray.d, weights, valid)
         return list(zip(vertices, weights, strict=True)), valid
 
     def footprint(self, ray: mi.Ray3f, u: mi.Point2f) -> tuple[list[Share], mi.Mask, mi.Mask]:

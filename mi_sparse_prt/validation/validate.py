@@ -20,6 +20,7 @@ from mi_sparse_prt.core.metrics import (
     relative_l2_without_noise,
     relative_noise,
 )
+from mi_sparse_prt.measurement.coincident_surfaces import lie_on_others
 from mi_sparse_prt.measurement.vertices import Points, VertexRays, sensor_points, vertex_points, vertex_rays
 from mi_sparse_prt.relighting.image import background_emitter, check_camera, render
 from mi_sparse_prt.scene.scene import Scene
@@ -126,8 +127,9 @@ def validate(
     Raises
     ------
     PrtError
-        If the matrix belongs to another scene, or its pixels to another camera; or if it is of single directions, in a
-        scene of mirrors, glass or masks, in which Mitsuba's directional lights do not shine as environments do.
+        If the matrix belongs to another scene, or its pixels to another camera; if it is of single directions, in a
+        scene of mirrors, glass or masks, in which Mitsuba's directional lights do not shine as environments do; or if
+        none of the vertices chosen can be seen.
 
     Notes
     -----
@@ -146,6 +148,11 @@ def validate(
     left_out = _left_out(scene, transport)
     rng = np.random.default_rng([seed, 2])
     rows = _chosen_rows(scene, transport, n_rows, sensor, rng)
+    if rows.missed:
+        left_out.append(
+            f"{rows.missed} rows of vertices inside of other surfaces or on these: "
+            "which of the two Mitsuba sees is a matter of rounding"
+        )
     elements = _stratified(transport.shape[1], n_columns, rng)
     if rows.camera is not None:
         spp = max(PIXEL_SPP, spp * n_rows // len(rows.ids))
@@ -179,12 +186,16 @@ def validate(
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rows that are compared: vertices, and rays that end at all of these, or pixels of a camera."""
+    """The rows that are compared: vertices, and rays that end at all of these, or pixels of a camera.
+
+    ``missed`` is how many were chosen, and cannot be compared.
+    """
 
     ids: NDArray[np.int64]
     groups: tuple[MeshRange, ...]
     rays: VertexRays | None = None
     camera: mi.Sensor | None = None
+    missed: int = 0
 
 
 def _left_out(scene: Scene, transport: LightTransport) -> list[str]:
@@ -215,7 +226,13 @@ def _chosen_rows(
         every = transport.emission.kind == "cubemap"
         seen = [m for m, k in zip(transport.meshes, scene.materials, strict=True) if every or k.diffuse]
         ids = _stratified_vertices(tuple(seen) or transport.meshes, n_rows, rng)
-        return _Rows(ids, transport.meshes, rays=vertex_rays(scene.normalised, scene))
+        rays = vertex_rays(scene.normalised, scene)
+        missed = rays.missed[ids] | lie_on_others(scene, rays.take(ids))
+        if missed.all():
+            raise PrtError(
+                "none of the vertices chosen can be seen: all are inside of other surfaces or on these"
+            )
+        return _Rows(ids[~missed], transport.meshes, rays, missed=int(missed.sum()))
     if transport.measurement.image is None:
         raise PrtError(f"validate renders vertices and pixels, not {transport.measurement.kind!r}")
     camera, pixels = scene.sensor(sensor), transport.shape[0]
