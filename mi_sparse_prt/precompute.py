@@ -190,8 +190,9 @@ class _Attempts:
         settings, costs = _measured(direct, settings, self._dark is None, run.clock)
         self._specular = None
         if self._dark is None and self._problem.specular_apart:
+            others = 0.0 if costs is None else CandidatePlans(costs, settings).error
             with run.clock.phase("specular"):
-                self._specular = SpecularSteps(self._problem, settings, run.seed)
+                self._specular = SpecularSteps(self._problem, settings, run.seed, others)
             costs = None if costs is None else _beside_specular(costs, self._specular)
         noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.light)
         self._proposals = _proposals(settings, costs, noise, run.clock)

@@ -138,6 +138,11 @@ class CandidatePlans:
         return self._best.seconds
 
     @property
+    def error(self) -> float:
+        """The relative L2 error that it is predicted to have."""
+        return self._best.error
+
+    @property
     def uncertain(self) -> str | None:
         """Direct light to find and to judge before anything else, as the choice depends on it."""
         return uncertain(self._costs, self._settings.target_error, self._settings.spp)

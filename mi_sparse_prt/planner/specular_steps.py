@@ -31,16 +31,18 @@ class SpecularSteps:
         Whose ``specular.error`` is aimed at, beside the errors of all other light; ``specular_error`` of this light
         alone is enough, if given: its noise is then no part of the error of all.
     seed : int
+    others : float
+        Error of all other light, as predicted: noise that does not matter beside it need not be found out.
     """
 
-    def __init__(self, problem: Problem, settings: Settings, seed: int) -> None:
+    def __init__(self, problem: Problem, settings: Settings, seed: int, others: float = 0.0) -> None:
         self._aim, self._target = settings.specular.error, settings.target_error
         self._own = settings.specular_error
         averaging = None
         if problem.scene.bends_light and problem.at_vertices is problem:
             averaging = SpecularNoise(problem, seed)
         self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
-        self._search.refine(AS_SOURCE * self._aim, self._own or 0.0)
+        self._search.refine(AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0)
         self._terms = term_rows(problem, seed) if problem.reflection.terms else None
 
     @property
@@ -83,4 +85,9 @@ class SpecularSteps:
         """
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
-        self._search.refine(max(self._aim, others * math.sqrt(MINIMUM_GAIN**-2 - 1), room), self._own or 0.0)
+        self._search.refine(max(self._aim, _worth(others), room), self._own or 0.0)
+
+
+def _worth(others: float) -> float:
+    """How large an error may be beside others, so that it makes all of them larger by a tenth."""
+    return others * math.sqrt(MINIMUM_GAIN**-2 - 1)
