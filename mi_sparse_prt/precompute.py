@@ -195,7 +195,7 @@ class _Attempts:
                 self._specular = SpecularSteps(self._problem, settings, run.seed, others)
             costs = None if costs is None else _beside_specular(costs, self._specular)
         noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.light)
-        self._proposals = _proposals(settings, costs, noise, run.clock)
+        self._proposals = _proposals(direct, settings, costs, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, light)
 
     def matrix(self) -> LightTransport:
@@ -415,12 +415,13 @@ def _beside_specular(costs: Costs, light: SpecularSteps) -> Costs:
 
 
 def _proposals(
-    settings: Settings, costs: Costs | None, specular: float, clock: Stopwatch
+    direct: DirectSolver, settings: Settings, costs: Costs | None, specular: float, clock: Stopwatch
 ) -> RefinementSchedule | CandidatePlans:
     """The plans to try, ranked by what was measured, if anything was; ``specular`` is an error of all."""
     elapsed = clock.report()["total"]
     if costs is None:
-        return refinement_schedule(settings, elapsed)
+        with clock.phase("plan"):
+            return refinement_schedule(settings, elapsed, direct)
     costs = replace(costs, fixed=costs.fixed + elapsed, specular=specular)
     return CandidatePlans(costs, settings)
 

@@ -52,7 +52,7 @@ class PilotElements:
     Parameters
     ----------
     problem : Problem
-        At the vertices.
+        At vertices; at other points, these are drawn from all together, as are the vertices of a mesh.
     indirect : bool
         Whether there is indirect light.
     seed : int or SeedSequence
@@ -89,8 +89,9 @@ class PilotElements:
         )
         stream = random_stream(seed, PILOT)
         self._seeds, rng = element_seeds(stream, 4), np.random.default_rng(stream)
-        strata = scene.sampled_together
-        most = vertices_per_mesh * (TOGETHER if len(strata) < len(scene.meshes) else 1)
+        apart = problem.measurement.kind == "vertices"
+        strata = scene.sampled_together if apart else (slice(0, len(problem.points)),)
+        most = vertices_per_mesh * (TOGETHER if apart and len(strata) < len(scene.meshes) else 1)
         sizes = [part.stop - part.start for part in strata]
         chosen = [
             part.start + np.sort(rng.choice(size, min(size, most), replace=False))
@@ -101,7 +102,9 @@ class PilotElements:
         self.stand_for = np.repeat(np.divide(sizes, counts), counts)
         n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
         self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
-        self._albedo = scene.albedo[self.vertices][:, None].astype(np.float64)  # [vertex, 1, rgb]
+        self._albedo = problem.reflection.albedo[self.vertices][:, None].astype(
+            np.float64
+        )  # [vertex, 1, rgb]
         self.direct = self._direct()
         self.indirect = self.paths(problem.max_depth) if indirect else None
         whole = self.direct.values + (self.indirect.values if self.indirect else 0)

@@ -24,6 +24,8 @@ from mi_sparse_prt.planner.choice import (
     weighed,
     with_direct,
 )
+from mi_sparse_prt.planner.texel_shares import TexelShares
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 ATTEMPTS = 4
 TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
@@ -39,6 +41,8 @@ class RefinementSchedule:
         Seconds, in all, that a next one is not to exceed.
     started : float
         Seconds before the first plan.
+    shares : TexelShares, optional
+        Chooses how direct light is found, of each plan when it is its turn.
 
     Attributes
     ----------
@@ -53,8 +57,16 @@ class RefinementSchedule:
     seconds: float | None = None
     too_long: Predicted | None = None
 
-    def __init__(self, plans: Sequence[Plan], limit: float = math.inf, started: float = 0.0) -> None:
-        self.plan, *self._others = plans
+    def __init__(
+        self,
+        plans: Sequence[Plan],
+        limit: float = math.inf,
+        started: float = 0.0,
+        shares: TexelShares | None = None,
+    ) -> None:
+        first, *self._others = plans
+        self._shares = shares
+        self.plan = self._with_shares(first)
         self._limit, self._started, self._error = limit, started, math.inf
 
     def after(self, found: HeldOutError, elapsed: float, of_rays: float = math.inf) -> bool:
@@ -65,18 +77,26 @@ class RefinementSchedule:
         """
         if not self._others:
             return False
-        before, following = self.plan, self._others[0]
-        if before.indirect == "gather" and _kind(before) == _kind(following):
-            more = following.rays / before.rays
-            refinable = min(found.parts["indirect"], of_rays)
-            least = math.sqrt(max(found.total**2 - refinable**2 * (1 - 1 / more), 0.0))
+        before, following = self.plan, self._with_shares(self._others[0])
+        if before.indirect == following.indirect == "gather":
+            more, same = following.rays / before.rays, _light(before) == _light(following)
+            refinable = min(found.parts.get("indirect", 0.0), of_rays)
+            square = found.total**2 - refinable**2 * (1 - 1 / more)
+            if not same:  # finer direct light comes as near as the plan's tolerance
+                square -= max(found.parts["direct"] ** 2 - following.tolerance**2, 0.0)
             seconds = elapsed + more * (elapsed - self._started)
             # the most that more rays can do, and what they did last time
-            helped = max(least / found.total, found.total / self._error) <= MINIMUM_GAIN
-            if not helped or seconds > self._limit:
+            helped = max(
+                math.sqrt(max(square, 0.0)) / found.total, found.total / self._error if same else 0.0
+            )
+            if helped > MINIMUM_GAIN or seconds > self._limit:
                 return False
-        self.plan, self._started, self._error = self._others.pop(0), elapsed, found.total
+        self._others.pop(0)
+        self.plan, self._started, self._error = following, elapsed, found.total
         return True
+
+    def _with_shares(self, plan: Plan) -> Plan:
+        return plan if self._shares is None else self._shares.of(plan)
 
     def weighed(self, found: HeldOutError) -> HeldOutError:
         """The error of the present plan: what was found, as nothing was predicted."""
@@ -199,6 +219,11 @@ class CandidatePlans:
         return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
 
 
+def _light(plan: Plan) -> tuple[str, int | None]:
+    """How direct light is found."""
+    return plan.direct, plan.strata
+
+
 def _kind(plan: Plan) -> tuple[str, str]:
     return plan.direct, plan.indirect
 
@@ -219,8 +244,9 @@ def error_without_noise(found: Sequence[tuple[Plan, float]]) -> float:
     return math.sqrt(max(rest, 0.0))
 
 
-def refinement_schedule(settings: Settings, started: float) -> RefinementSchedule:
+def refinement_schedule(settings: Settings, started: float, direct: DirectSolver) -> RefinementSchedule:
     """The plan of a method; with a target error, from the coarsest of its plans on, after so many seconds."""
+    shares = None if isinstance(settings.method, Plan) else TexelShares(direct, settings)
     plans: Sequence[Plan]
     if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
         plans = [settings.with_shares(plan) for plan in EFFORTS["gather"]]
@@ -229,4 +255,4 @@ def refinement_schedule(settings: Settings, started: float) -> RefinementSchedul
     else:
         plans = [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
     limit = settings.max_seconds if settings.method == "auto" else math.inf
-    return RefinementSchedule(plans, limit, started)
+    return RefinementSchedule(plans, limit, started, shares)

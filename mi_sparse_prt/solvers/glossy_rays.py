@@ -185,7 +185,7 @@ def gather_rays(
 
 def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.Vector3f) -> Floats:
     """Factors (lanes, k) of those lanes, few as a rule, whose vertices are glossy."""
-    lanes = dr.compress(lobes.is_glossy(vertex))
+    lanes = dr.compress(lobes.is_glossy(vertex)) if dr.width(vertex) else mi.UInt32()
     if not len(lanes):
         return np.empty((0, len(look_up(mi.UInt32(0), mi.Vector3f(0, 0, 1)))), np.float32)
     values = look_up(dr.gather(mi.UInt32, vertex, lanes), dr.gather(mi.Vector3f, direction, lanes))
