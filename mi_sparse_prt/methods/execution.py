@@ -29,7 +29,7 @@ from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.adaptive_strata import adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.glossy_radiosity import glossy_indirect
+from mi_sparse_prt.solvers.glossy_radiosity import GatherEffort, glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import Gathered, GatheredByDepth, RadiositySolver
@@ -198,8 +198,11 @@ class Execution:
             problem, seed = self._problem, self._run.seed
             nodes = choose_nodes(problem.scene, problem.points)
             specular = None if light.specular is None else light.specular.operator
-            averaging, options = self._averaging(plan, problem, nodes), (plan.rays, plan.tolerance)
-            part, noise = glossy_indirect(problem, direct, *options, nodes, seed, specular, averaging)
+            averaging, effort = (
+                self._averaging(plan, problem, nodes),
+                GatherEffort(plan.rays, plan.tolerance, seed),
+            )
+            part, noise = glossy_indirect(problem, direct, nodes, effort, specular, averaging)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays} | _rays_of(averaging)
         # the rank that leaves this out grows with the rays, too

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.mesh_cleaning import flip_sides
 from mi_sparse_prt.scene.subdivision import TIE, Doubles, Project, as_it_is, too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals, unique_rows
 
@@ -47,7 +46,6 @@ def parametric_mesh(
     *,
     limit: int,
     fewest: int = FEWEST,
-    flip: bool = False,
     weld: bool = False,
 ) -> TriangleMesh:
     """A Mitsuba `sphere`, `disk` or `cylinder` as a grid in its own (u, v) parametrisation.
@@ -63,8 +61,6 @@ def parametric_mesh(
         The largest number of vertices allowed.
     fewest : int
         Segments around, whatever the edge length: a multiple of 4.
-    flip : bool
-        Normals point inwards, or, on a disk, along its local -z.
     weld : bool
         Merge vertices of equal position and normal (the seam and the poles) and leave texture coordinates
         out: for materials that do not vary over the surface.
@@ -113,7 +109,7 @@ def parametric_mesh(
         keys = np.column_stack([positions, normals]) + np.float32(0)  # -0 and 0 are one
         first, index = unique_rows(keys)
         mesh = replace(mesh.take_vertices(first, index[triangles]), texcoords=None)
-    return flip_sides(mesh) if flip else mesh
+    return mesh
 
 
 def projection(shape: str, to_world: NDArray[np.float64]) -> Project:

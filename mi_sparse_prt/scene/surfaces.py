@@ -185,16 +185,10 @@ def _tessellate(
     kind, to_world = shape.class_name().lower(), _to_world(shape)
     # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
     mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
-    return parametric_mesh(
-        kind,
-        to_world,
-        edge_length,
-        material.name,
-        limit=limit,
-        fewest=fewest,
-        flip=shape.has_flipped_normals() != mirrored,
-        weld=material.constant,
+    mesh = parametric_mesh(
+        kind, to_world, edge_length, material.name, limit=limit, fewest=fewest, weld=material.constant
     )
+    return flip_sides(mesh) if shape.has_flipped_normals() != mirrored else mesh
 
 
 def _to_world(shape: mi.Shape) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -97,49 +97,60 @@ class FirstBounce:
     left_out: float
 
 
+class ReflectedLight(NamedTuple):
+    """G rho D of all channels.
+
+    Attributes
+    ----------
+    matrices : sequence of StackedFormFactors (n, n_v)
+        G of each channel, or one of all.
+    albedo : (channels, n_v) float32
+        rho.
+    lights : sequence of Operator
+        D of each channel, or one of all.
+    keys : (n,) uint64
+        Of the rows of G: random numbers are made of them.
+    weights : (n,) float32, optional
+        Above 0: errors of rows count by them.
+    """
+
+    matrices: Sequence[StackedFormFactors]
+    albedo: Floats
+    lights: Sequence[Operator]
+    keys: NDArray[np.uint64]
+    weights: Floats | None = None
+
+
 def first_bounce(
-    matrices: Sequence[StackedFormFactors],
-    albedo: Floats,
-    lights: Sequence[Operator],
-    keys: NDArray[np.uint64],
-    tolerance: float,
-    seed: int,
-    options: RandomBasis = USUAL,
-    weights: Floats | None = None,
+    light: ReflectedLight, tolerance: float, seed: int, options: RandomBasis = USUAL
 ) -> FirstBounce:
     """G rho D for all channels.
 
     Parameters
     ----------
-    matrices : sequence of StackedFormFactors (n, n_v)
-        G of each channel, or one of all.
-    albedo : (channels, n_v) float32
-    lights : sequence of Operator
-        D of each channel, or one of all.
-    keys : (n,) uint64
-        Of the rows of G: random numbers are made of them.
+    light : ReflectedLight
     tolerance : float
         Relative L2 error; it is larger where that would take a rank far above 1000.
     seed : int
     options : RandomBasis
-    weights : (n,) float32, optional
-        Above 0: errors of rows count by them.
 
     Returns
     -------
     FirstBounce
     """
-    rng = np.random.default_rng(seed)
-    hashes = mix(keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
-    columns, turn, missed = _basis(matrices, albedo, lights, weights, hashes, rng, tolerance, options)
-    count = options.row_count(turn.shape[1], len(keys))
+    rng, weights = np.random.default_rng(seed), light.weights
+    hashes = mix(light.keys ^ mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)))
+    columns, turn, missed = _basis(light, hashes, rng, tolerance, options)
+    count = options.row_count(turn.shape[1], len(hashes))
     rows, probability = _chosen_rows(_leverage(columns, turn, options.projections, rng), hashes, count)
     some = np.hstack([block[rows] for block in columns]).astype(np.float64) @ turn
     weighted = some.T / probability
     fit = np.linalg.solve(weighted @ some, weighted).astype(np.float32)  # rows to coefficients in the basis
     if weights is not None:
         fit *= weights[rows]
-    right = [fit @ known for known in _rows([m.rows(rows) for m in matrices], albedo, lights)]
+    right = [
+        fit @ known for known in _rows([m.rows(rows) for m in light.matrices], light.albedo, light.lights)
+    ]
     found = _truncated(columns, turn, right, missed, tolerance)
     if weights is not None:
         for x in found.left:
@@ -148,10 +159,7 @@ def first_bounce(
 
 
 def _basis(
-    matrices: Sequence[StackedFormFactors],
-    albedo: Floats,
-    lights: Sequence[Operator],
-    weights: Floats | None,
+    light: ReflectedLight,
     hashes: NDArray[np.uint64],
     rng: np.random.Generator,
     tolerance: float,
@@ -170,13 +178,13 @@ def _basis(
     blocks: list[Floats] = []  # [row, combination]
     short: list[Doubles] = []  # [sum of rows, combination]
     turn, energies = np.zeros((0, 0)), []  # [combination, vector of the basis]
-    draws, width = max(1, options.draws // len(albedo)), min(BITS, lights[0].shape[1])
-    mixed = np.empty((matrices[0].shape[1], draws * width), np.float32)
+    draws, width = max(1, options.draws // len(light.albedo)), min(BITS, light.lights[0].shape[1])
+    mixed = np.empty((light.matrices[0].shape[1], draws * width), np.float32)
     while True:
-        found = _combinations(matrices, albedo, lights, mixed, options.mixed, rng)
-        if weights is not None:
+        found = _combinations(light, mixed, options.mixed, rng)
+        if light.weights is not None:
             for block in found:
-                block *= weights[:, None]
+                block *= light.weights[:, None]
         sums = found if shorten is None else [multiply_sparse(shorten, block) for block in found]
         new = np.hstack(sums).astype(np.float64)
         products = [old.T @ new for old in (*short, new)]
@@ -208,23 +216,16 @@ def _sums(hashes: NDArray[np.uint64], count: int) -> scipy.sparse.csr_array | No
     return scipy.sparse.csr_array(entries, shape=(count, n))
 
 
-def _combinations(
-    matrices: Sequence[StackedFormFactors],
-    albedo: Floats,
-    lights: Sequence[Operator],
-    mixed: Floats,
-    few: int,
-    rng: np.random.Generator,
-) -> list[Floats]:
+def _combinations(light: ReflectedLight, mixed: Floats, few: int, rng: np.random.Generator) -> list[Floats]:
     """Sums of a few random columns each, with random signs: (n, combinations) of each channel.
 
     ``mixed`` (n_v, combinations of a channel) is overwritten.
     """
-    found, width = [], min(BITS, lights[0].shape[1])
-    for c, rho in enumerate(albedo):
+    found, width = [], min(BITS, light.lights[0].shape[1])
+    for c, rho in enumerate(light.albedo):
         for a in range(0, mixed.shape[1], width):
-            combine_randomly(of_channel(lights, c), few, rng, mixed[:, a : a + width])
-        found.append(of_channel(matrices, c).reflect(rho[None], mixed)[0])
+            combine_randomly(of_channel(light.lights, c), few, rng, mixed[:, a : a + width])
+        found.append(of_channel(light.matrices, c).reflect(rho[None], mixed)[0])
     return found
 
 

@@ -8,6 +8,7 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 from collections.abc import Sequence
 
 import numpy as np
@@ -106,13 +107,28 @@ def nodes_and_terms(nodes: Nodes, direct: FactoredVisibility) -> Nodes:
     return Nodes(np.concatenate([nodes.ids, np.arange(n, rows)]), weights)
 
 
+class GatherEffort(NamedTuple):
+    """How much is done for light among surfaces.
+
+    Attributes
+    ----------
+    rays_per_vertex : int
+        A power of two.
+    tolerance : float
+        As for ``RadiositySolver.indirect``, of radiance; no less than most of the noise of the rays.
+    seed : int
+    """
+
+    rays_per_vertex: int
+    tolerance: float
+    seed: int
+
+
 def glossy_indirect(
     problem: Problem,
     direct: FactoredVisibility,
-    rays_per_vertex: int,
-    tolerance: float,
     nodes: Nodes,
-    seed: int,
+    effort: GatherEffort,
     specular: SparseRows | ByDepth | None = None,
     averaging: Averaging | None = None,
 ) -> tuple[Gathered | GatheredByDepth, Noise]:
@@ -123,13 +139,9 @@ def glossy_indirect(
     problem : Problem
         Its reflection has the factors of ``direct``.
     direct : FactoredVisibility
-    rays_per_vertex : int
-        A power of two.
-    tolerance : float
-        As for ``RadiositySolver.indirect``, of radiance; no less than most of the noise of the rays.
     nodes : Nodes
         Vertices that gather unit-albedo light, others interpolate theirs; terms are gathered at all glossy ones.
-    seed : int
+    effort : GatherEffort
     specular : SparseRows or ByDepth, optional
         Light from the sky by way of mirrors and glass, which surfaces send on as well. What they send on by way of
         mirrors and glass reaches unit-albedo rows, and of glossy surfaces as far as these are diffuse.
@@ -139,6 +151,7 @@ def glossy_indirect(
     assert isinstance(problem.reflection, InOutFactors)
     albedo, outgoing = _channels(problem.reflection)
     points = np.union1d(nodes.ids, direct.glossy)
+    rays_per_vertex, tolerance, seed = effort
     rays = gather_rays(problem, outgoing, rays_per_vertex, seed, points)
     noise = rays.noise(direct, problem.reflection, problem.points, seed)
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))

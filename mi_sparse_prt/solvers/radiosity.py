@@ -39,6 +39,7 @@ from mi_sparse_prt.operators.sum import Sum
 from mi_sparse_prt.solvers.first_bounce import (
     FirstBounce,
     RandomBasis,
+    ReflectedLight,
     all_but_least,
     first_bounce,
     of_channel,
@@ -282,16 +283,14 @@ class FiniteElements:
             right = np.zeros((0, direct.shape[1]), np.float32)
             return Gathered((left,) * self.channels, (right,) * self.channels, 0.0, 0)
         lights = [direct] if specular is None else _with_specular(direct, specular)
-        first = first_bounce(
+        reflected = ReflectedLight(
             [StackedFormFactors([matrix]) for matrix in self._sums],
             self._coloured(len(lights)),
             lights,
             self._keys[self.nodes.ids],
-            tolerance,
-            self.seed,
-            self.options.basis,
             self.weights,
         )
+        first = first_bounce(reflected, tolerance, self.seed, self.options.basis)
         totals = self._all_bounces(first, count, self.options.later * tolerance**2)
         self._judge_noise([of_channel(lights, 1)], count)
         spread = tuple(self._spread(total) for total in totals)
@@ -328,16 +327,14 @@ class FiniteElements:
         albedo = self._coloured(colours)
         stacks = [Stacked(tuple(_channel(lights[t], c) for t in lit)) for c in range(colours)]
         keys = self._keys[self.nodes.ids]
-        first = first_bounce(
+        reflected = ReflectedLight(
             [StackedFormFactors(own, lit, count) for own in self._matrices],
             np.tile(albedo, len(lit)),
             stacks,
             np.concatenate([mix(keys + np.uint64(s)) if s else keys for s in range(count)]),
-            tolerance,
-            self.seed,
-            self.options.basis,
             None if self.weights is None else np.tile(self.weights, count),
         )
+        first = first_bounce(reflected, tolerance, self.seed, self.options.basis)
         light = [np.split(x, count) for x in first.left]  # [channel][depth]
         sizes = [np.square(right).sum(axis=1, dtype=np.float64) for right in first.right]
         energies = [sum(map(self._energies, x)) * size for x, size in zip(light, sizes, strict=True)]
@@ -546,15 +543,9 @@ class RadiositySolver(FiniteElements):
         matrix = scipy.sparse.csr_array(sum(found[1:], found[0]))
         self.rays += len(points) * self._rays_per_vertex
         lights = [direct] if specular is None else _with_specular(direct, specular)
-        first = first_bounce(
-            [StackedFormFactors([matrix])],
-            self._coloured(len(lights)),
-            lights,
-            points.keys,
-            tolerance,
-            self.seed,
-            self.options.basis,
-        )
+        albedo = self._coloured(len(lights))
+        reflected = ReflectedLight([StackedFormFactors([matrix])], albedo, lights, points.keys)
+        first = first_bounce(reflected, tolerance, self.seed, self.options.basis)
         specular = Sum(specular.by_depth) if specular is not None and specular.by_depth else specular
         before = self.indirect(direct, tolerance, specular)  # what vertices receive, one bounce before
         assert isinstance(before, Gathered)

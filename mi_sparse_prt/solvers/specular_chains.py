@@ -349,18 +349,19 @@ class SpecularChains:
             weight: mi.Color3f,
             straight: mi.Mask,
             met: mi.UInt32,
-            column: mi.UInt32,
-            brought: mi.Color3f,
+            found: tuple[mi.UInt32, mi.Color3f],  # a column and its weight
             alive: mi.Mask,
         ) -> tuple[Any, ...]:
             hit = self._scene.unsplit.ray_intersect_preliminary(ray, active=alive)
             texel, _ = self._light_met(hit, ray, alive & ~straight)
             ends = alive & (texel != NOTHING) & (dr.max(weight) > 0)
-            column = dr.select(ends, (met - 1) * size + texel, column)
-            brought = dr.select(ends, weight, brought)
+            found = (
+                dr.select(ends, (met - 1) * size + texel, found[0]),
+                dr.select(ends, weight, found[1]),
+            )
             si = self._scene.unsplit.interaction(hit, ray, alive)
             goes_on, ray, weight, null = self._sent_on(si, weight, rng, alive & (met < longest))
-            return ray, rng, weight, straight & null, met + 1, column, brought, goes_on
+            return ray, rng, weight, straight & null, met + 1, found, goes_on
 
         n = len(index)
         state = (
@@ -369,11 +370,10 @@ class SpecularChains:
             dr.full(mi.Color3f, 1, n),
             dr.full(mi.Mask, True, n),
             mi.UInt32(0),
-            dr.full(mi.UInt32, NOTHING, n),
-            dr.zeros(mi.Color3f, n),
+            (dr.full(mi.UInt32, NOTHING, n), dr.zeros(mi.Color3f, n)),
             dr.full(mi.Mask, True, n),
         )
-        *_, column, brought, _ = dr.while_loop(state, lambda *state: state[-1], go_on, mode="symbolic")
+        *_, (column, brought), _ = dr.while_loop(state, lambda *state: state[-1], go_on, mode="symbolic")
         dr.eval(column, brought)
         return kept_ends(_Ends(of, column, brought, column != NOTHING))
 
