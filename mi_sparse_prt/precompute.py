@@ -25,7 +25,7 @@ from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_of
 from mi_sparse_prt.methods.lamps import SPP, gathered_lamps, path_traced_lamps
-from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
@@ -190,7 +190,7 @@ class _Attempts:
         settings, costs = _measured(direct, settings, self._dark is None, run.clock)
         self._specular = None
         if self._dark is None and self._problem.specular_apart:
-            others = 0.0 if costs is None else CandidatePlans(costs, settings).error
+            others = _predicted_error(settings, costs)
             with run.clock.phase("specular"):
                 self._specular = SpecularSteps(self._problem, settings, run.seed, others)
             costs = None if costs is None else _beside_specular(costs, self._specular)
@@ -284,8 +284,9 @@ class _Attempts:
         if self._specular is None or self._specular.done:
             return parts
         found = found or self._judged(parts, len(attempts), TARGET)
+        spent = self._run.clock.report()
         with self._run.clock.phase("specular"):
-            self._specular.refine(found)
+            self._specular.refine(found, spent["total"] - spent["specular"])
             light = self._specular.light
         return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 
@@ -412,6 +413,15 @@ def _beside_specular(costs: Costs, light: SpecularSteps) -> Costs:
     if light.seen is not None:
         direct = {how: cost.with_known_centres for how, cost in direct.items()}
     return replace(costs, direct=direct, bent=light.most)
+
+
+def _predicted_error(settings: Settings, costs: Costs | None) -> float:
+    """Of all light but that by way of mirrors and glass; 0 where nothing tells."""
+    if costs is not None:
+        return CandidatePlans(costs, settings).error
+    if settings.method == "auto" and settings.target_error is None:
+        return EFFORTS["gather"][0].tolerance  # of its first and only plan
+    return 0.0
 
 
 def _proposals(

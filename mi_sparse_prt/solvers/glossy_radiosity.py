@@ -8,8 +8,8 @@ light) and by f_k(w) pi / cos (its own terms), is one sparse matrix over all of 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
