@@ -284,9 +284,8 @@ class _Attempts:
         if self._specular is None or self._specular.done:
             return parts
         found = found or self._judged(parts, len(attempts), TARGET)
-        spent = self._run.clock.report()
         with self._run.clock.phase("specular"):
-            self._specular.refine(found, spent["total"] - spent["specular"])
+            self._specular.refine(found)
             light = self._specular.light
         return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 
