@@ -37,6 +37,7 @@ from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
 ALL_ROUND = 64  # spheres, disks and cylinders of as many segments as one has: 35,000 vertices
 LEAST_AROUND = 12  # of many: seen from the side, they lack 3% of their radius
 
+OFF = 0.01  # entries of a transform times its inverse: axes of three digits are less so
 _BECOME_TRIANGLES = {"Sphere", "Disk", "Cylinder", "BSplineCurve", "LinearCurve", "Ellipsoids"}
 
 _INSIDE = " {} inside {}: media are left out, light passes as through a vacuum (volpath renders them)"
@@ -192,8 +193,21 @@ def _tessellate(
 
 
 def _to_world(shape: mi.Shape) -> NDArray[np.float64]:
-    """Local to world (4, 4). A sphere is one to Mitsuba however it is scaled: its x axis has the radius."""
-    to_world = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    """Local to world (4, 4). A sphere is one to Mitsuba however it is scaled: its x axis has the radius.
+
+    Raises
+    ------
+    PrtError
+        If Mitsuba's own inverse is that of another transform: its rays would meet what is not where the shape is.
+    """
+    given = mi.traverse(shape)["to_world"]
+    to_world = np.array(given.matrix, dtype=np.float64).reshape(4, 4)
+    back = to_world @ np.array(given.inverse().matrix, dtype=np.float64).reshape(4, 4)
+    if np.abs(back[:3, :3] - np.eye(3)).max() > OFF:
+        raise PrtError(
+            f"shape '{shape.id()}': its to_world rotates about an axis whose length is not 1, of which Mitsuba makes a "
+            "shape that rays do not meet where it lies: give the axis a length of 1"
+        )
     if shape.class_name() == "Sphere" and (radius := np.linalg.norm(to_world[:3, 0])) > 0:
         left, _, right = np.linalg.svd(to_world[:3, :3])
         to_world[:3, :3] = radius * left @ right
