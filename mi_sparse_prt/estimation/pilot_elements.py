@@ -102,9 +102,10 @@ class PilotElements:
         self.stand_for = np.repeat(np.divide(sizes, counts), counts)
         n, t = lighting.n_directions, min(lighting.n_directions, texels_per_vertex)
         self.texels = np.stack([rng.choice(n, t, replace=False) for _ in self.vertices])
-        self._albedo = problem.reflection.albedo[self.vertices][:, None].astype(
-            np.float64
-        )  # [vertex, 1, rgb]
+        albedo = (
+            scene.albedo if apart else problem.reflection.albedo
+        )  # of glossy vertices all that they reflect
+        self._albedo = albedo[self.vertices][:, None].astype(np.float64)  # [vertex, 1, rgb]
         self.direct = self._direct()
         self.indirect = self.paths(problem.max_depth) if indirect else None
         whole = self.direct.values + (self.indirect.values if self.indirect else 0)

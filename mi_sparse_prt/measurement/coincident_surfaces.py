@@ -33,8 +33,9 @@ def lie_on_others(scene: Scene, rays: VertexRays) -> NDArray[np.bool_]:
     triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
     straight = mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
     hit = scene.normalised.ray_intersect_preliminary(straight)
-    way = dr.select(hit.is_valid(), hit.t, 0)
-    end, triangle = straight(way), scene.normalised.triangle(hit, hit.is_valid())
+    valid = hit.is_valid()
+    way = dr.select(valid, hit.t, 0)
+    end, triangle = straight(way), dr.select(valid, scene.normalised.triangle(hit, valid), 0)
     dr.eval(way, end, triangle)
     lane = dr.arange(mi.UInt32, len(rays.missed) * RAYS)
     point, k = lane // RAYS, lane % RAYS

@@ -90,12 +90,8 @@ class CoveredCorners:
         """(2, n_t): three bits for triangles, on the side of their normals or, if that is -1, the other."""
         p = [mi.Point3f(np.ascontiguousarray(corners[:, k].T)) for k in range(3)]
         normal = side * dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
-        middle, height, around, every = (
-            (p[0] + p[1] + p[2]) / 3,
-            narrow_height(p),
-            around_of(p),
-            mi.Mask(True),
-        )
+        middle, every = (p[0] + p[1] + p[2]) / 3, mi.Mask(True)
+        height, around = narrow_height(p), around_of(p)
         found = np.zeros((2, len(corners)), np.uint8)
         for bit, corner in enumerate(p):
             narrow = self._room(dr.lerp(corner, middle, ASIDE), normal, height, every)[0] < height
@@ -177,8 +173,7 @@ def around_of(corners: Sequence[mi.Point3f]) -> mi.Float:
 
 
 def _stand_ins(covered: NDArray[np.uint8], corners: Corners, ends: NDArray[np.integer]) -> NDArray[np.uint32]:
-    """(n_t, 2): which triangle stands in for each, in front and behind: itself where it has corners
-    that are not covered."""
+    """(n_t, 2): which triangle stands in for each, in front and behind: itself, unless all its corners are covered."""
     found = np.repeat(np.arange(len(covered), dtype=np.uint32)[:, None], 2, axis=1)
     for (start, end), side in itertools.product(itertools.pairwise(ends), (0, 1)):
         within = (covered[start:end] >> 3 * side) & ALL == ALL

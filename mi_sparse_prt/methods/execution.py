@@ -198,10 +198,8 @@ class Execution:
             problem, seed = self._problem, self._run.seed
             nodes = choose_nodes(problem.scene, problem.points)
             specular = None if light.specular is None else light.specular.operator
-            averaging, effort = (
-                self._averaging(plan, problem, nodes),
-                GatherEffort(plan.rays, plan.tolerance, seed),
-            )
+            averaging = self._averaging(plan, problem, nodes)
+            effort = GatherEffort(plan.rays, plan.tolerance, seed)
             part, noise = glossy_indirect(problem, direct, nodes, effort, specular, averaging)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays} | _rays_of(averaging)

@@ -11,7 +11,6 @@ from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
 from mi_sparse_prt.planner.direct_costs import adaptive_cost, edges_error
-from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -35,10 +34,7 @@ class TexelShares:
     """
 
     def __init__(self, direct: DirectSolver, settings: Settings) -> None:
-        problem = direct.problem
-        if problem.reflection.terms:  # light counts by all that surfaces reflect
-            problem = replace(problem, reflection=Diffuse(problem.scene.albedo))
-        self._direct, self._settings = DirectSolver(problem), settings
+        self._direct, self._settings = direct, settings
 
     def of(self, plan: Plan) -> Plan:
         """The plan, with adaptive strata if edges miss its tolerance, or what a target has room for, and these less."""
