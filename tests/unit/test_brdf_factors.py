@@ -12,11 +12,13 @@ from mi_sparse_prt.reflection.brdf_factors import (
     diffuse_reflectance,
     evaluate_brdf,
     factor_brdf,
+    factorization,
     measure_factor_error,
 )
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.factor_error import sample_pairs
 from mi_sparse_prt.reflection.brdf_factors.factorization import glossy_rows
+from mi_sparse_prt.reflection.brdf_factors.isotropic import values_by_turn
 
 SMALL = DirectionGrid(12, 24)
 TINY = DirectionGrid(8, 16)
@@ -377,3 +379,27 @@ def test_mitsubas_own(kind):
     bsdf = mi.load_dict({"type": kind, **rough})
     error = measure_factor_error(factor_brdf(bsdf, "ball", 16, DirectionGrid(24, 48)), bsdf, "ball")
     assert error.whole[15] < 0.67 * error.whole[0]
+
+
+@pytest.mark.parametrize("terms", [1, 4, 16])
+def test_waves_of_an_isotropic_brdf_are_as_good_as_all_pairs(terms, monkeypatch):
+    """Coloured gold on a small grid; squared errors over the light that factors are made for, by the whole matrix."""
+    gold = mi.load_dict({"type": "roughconductor", "alpha": 0.3, "material": "Au"})
+    smooth, rest = factorization._light(SMALL)
+    matrix = factorization._weighted_matrix(GlossyPart(gold, "gold"), SMALL)
+    into, out = factorization._weights(SMALL)
+
+    def squared_error() -> float:
+        found = factor_brdf(gold, "gold", terms, SMALL)
+        right = (found.outgoing * out).reshape(terms, -1)
+        off = matrix - (found.incident * into).T @ right
+        return float(np.square(smooth @ off).sum() + rest * np.square(off).sum())
+
+    by_waves = squared_error()
+    monkeypatch.setattr(factorization, "values_by_turn", lambda *_: None)
+    assert 0.95 * squared_error() < by_waves <= 1.001 * squared_error()
+
+
+@pytest.mark.parametrize("bsdf", [BRUSHED, {"type": "roughconductor", "alpha_u": 0.2, "alpha_v": 0.21}])
+def test_an_anisotropic_brdf_has_no_waves(bsdf):
+    assert values_by_turn(GlossyPart(mi.load_dict(bsdf), "brushed"), SMALL) is None

@@ -79,11 +79,14 @@ class GlossyPart:
 
     def rows(self, grid: DirectionGrid, some: slice) -> Floats:
         """The same, (b, channels, outgoing), for some of a grid's incident directions and all outgoing ones."""
-        n, count = len(grid.directions), some.stop - some.start
+        n = len(grid.directions)
+        start, stop, step = some.indices(n)
+        count = len(range(start, stop, step))
         every = mi.Vector3f(np.ascontiguousarray(grid.directions.T))
         lane = dr.arange(mi.UInt32, count * n)
         row = lane // dr.opaque(mi.UInt32, n)
-        light = dr.gather(mi.Vector3f, every, row + dr.opaque(mi.UInt32, some.start))
+        incident = row * dr.opaque(mi.UInt32, step) + dr.opaque(mi.UInt32, start)
+        light = dr.gather(mi.Vector3f, every, incident)
         channels = self._glossy(light, dr.gather(mi.Vector3f, every, lane - row * dr.opaque(mi.UInt32, n)))
         return np.stack([channel.numpy().reshape(count, n) for channel in channels], axis=1)
 

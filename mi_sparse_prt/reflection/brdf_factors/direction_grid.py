@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 from scipy.special import gammaln, lpmv
+
+from mi_sparse_prt.core.sparse_product import multiply_sparse
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -44,31 +47,45 @@ class DirectionGrid:
 
         They are orthonormal on the whole sphere, not on this half of it.
         """
-        w = self.directions.astype(np.float64)
-        phi = np.arctan2(w[:, 1], w[:, 0])
+        waves = np.arange(order + 1)[:, None] * (
+            (np.arange(self.azimuths) + 0.5) * (2 * np.pi / self.azimuths)
+        )
+        sine, cosine, heights = np.sin(waves), np.cos(waves), self.harmonics_by_height(order)
         found = []
         for degree in range(order + 1):
             for m in range(-degree, degree + 1):
-                k = abs(m)
-                ratio = np.exp(gammaln(degree - k + 1) - gammaln(degree + k + 1))  # of factorials
-                around = np.sqrt(2) * (np.sin(k * phi) if m < 0 else np.cos(k * phi)) if m else 1.0
-                norm = np.sqrt((2 * degree + 1) / (4 * np.pi) * ratio)
-                found.append(norm * lpmv(k, degree, w[:, 2]) * around)
+                around = sine[-m] if m < 0 else cosine[m]
+                found.append(np.multiply.outer(heights[degree, abs(m)], around).ravel())
         return np.array(found)
 
-    def interpolate(self, values: NDArray[np.floating], directions: Floats) -> NDArray[np.floating]:
+    def harmonics_by_height(self, order: int) -> Doubles:
+        """What of real spherical harmonics depends on the height, (order + 1, order + 1, heights), by degree and m.
+
+        Times sin(m phi) and cos(m phi) it is the harmonics; 0 where m is larger than the degree.
+        """
+        height = np.cos((np.arange(self.heights) + 0.5) * (np.pi / 2 / self.heights))
+        found = np.zeros((order + 1, order + 1, self.heights))
+        for degree in range(order + 1):
+            for m in range(degree + 1):
+                ratio = np.exp(gammaln(degree - m + 1) - gammaln(degree + m + 1))  # of factorials
+                norm = np.sqrt((2 * degree + 1) / (4 * np.pi) * ratio * (2 if m else 1))
+                found[degree, m] = norm * lpmv(m, degree, height)
+        return found
+
+    def interpolate(self, values: NDArray[np.floating], directions: Floats) -> Floats:
         """Values (..., heights * azimuths) at directions (m, 3): (..., m); 0 below the horizon."""
         theta = np.arccos(np.clip(directions[:, 2], 0, 1)) * (self.heights / (np.pi / 2)) - 0.5
         phi = np.arctan2(directions[:, 1], directions[:, 0]) * (self.azimuths / (2 * np.pi)) - 0.5
         row, column = np.floor(theta).astype(np.int64), np.floor(phi).astype(np.int64)
         a, b = (theta - row).astype(np.float32), (phi - column).astype(np.float32)
-        total: NDArray[np.floating] = np.zeros((*values.shape[:-1], len(directions)), values.dtype)
-        for down, across, weight in (
-            (0, 0, (1 - a) * (1 - b)),
-            (0, 1, (1 - a) * b),
-            (1, 0, a * (1 - b)),
-            (1, 1, a * b),
-        ):
-            place = np.clip(row + down, 0, self.heights - 1) * self.azimuths
-            total += values[..., place + (column + across) % self.azimuths] * weight
-        return total * (directions[:, 2] > 0)
+        above = np.clip(row + np.array([[0], [1]]), 0, self.heights - 1) * self.azimuths
+        places = above[:, None] + (column + np.array([[0], [1]])) % self.azimuths  # [down, across, direction]
+        weights = np.stack([1 - a, a])[:, None] * np.stack([1 - b, b]) * (directions[:, 2] > 0)
+        flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]).T, np.float32)
+        corners = (
+            weights.reshape(4, -1).T.ravel(),
+            places.reshape(4, -1).T.ravel(),
+            np.arange(0, 4 * len(row) + 1, 4),
+        )
+        found = multiply_sparse(scipy.sparse.csr_array(corners, shape=(len(row), len(flat))), flat)
+        return found.T.reshape(*values.shape[:-1], len(row))

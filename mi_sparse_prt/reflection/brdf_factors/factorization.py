@@ -25,11 +25,14 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.reflection.brdf_factors.diffuse_part import GlossyPart
 from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, Doubles, Floats
+from mi_sparse_prt.reflection.brdf_factors.isotropic import factor_waves, values_by_turn
 
 MOST_TERMS = 16
+LIGHT_ORDER = 16  # of harmonics by which light is not white noise
 LIGHT_FALL = 2.0  # power of light per harmonic of degree l is (l + 1)^-LIGHT_FALL, see above
 
 
@@ -148,11 +151,19 @@ def factor_brdf(
     part = GlossyPart(bsdf, name)
     grid = grid or DirectionGrid()
     into, out = _weights(grid)
-    left, right = _factorise(_weighted_matrix(part, grid), _light(grid), terms, seed)
+    alike = values_by_turn(part, grid)
+    left: NDArray[np.floating]
+    right: NDArray[np.floating]
+    if alike is None:
+        left, right = _factorise(_weighted_matrix(part, grid), _light(grid), terms, seed)
+    else:
+        left, right = factor_waves(alike, grid, (into, out), _light_by_waves(grid), terms)
     return join_factors(part, grid, left.T / into, right.reshape(len(right), part.channels, -1) / out)
 
 
-def join_factors(part: GlossyPart, grid: DirectionGrid, incident: Doubles, outgoing: Doubles) -> BrdfFactors:
+def join_factors(
+    part: GlossyPart, grid: DirectionGrid, incident: NDArray[np.floating], outgoing: NDArray[np.floating]
+) -> BrdfFactors:
     """Factors (K, grid) and (K, channels, grid) of a glossy part, with the diffuse one unless that varies."""
     diffuse = part.diffuse[: part.channels] * (not part.varying_diffuse)
     f, g = incident.astype(np.float32), outgoing.astype(np.float32)
@@ -193,12 +204,25 @@ def _light(grid: DirectionGrid) -> tuple[Floats, float]:
     """The mean product of light from two incident directions, times roots of their solid angles: (r, grid) whose
     product with itself, transposed, and with this much of the identity added, is that matrix.
     """
-    order = 16
-    degree = np.repeat(np.arange(order + 1), 2 * np.arange(order + 1) + 1)
-    rest = (order + 2.0) ** -LIGHT_FALL  # of all higher degrees
-    amplitude = np.sqrt((degree + 1.0) ** -LIGHT_FALL - rest)
-    smooth = amplitude[:, None] * grid.harmonics(order) * np.sqrt(grid.solid_angles)
+    amplitude, rest = _amplitudes()
+    degree = np.repeat(np.arange(LIGHT_ORDER + 1), 2 * np.arange(LIGHT_ORDER + 1) + 1)
+    smooth = amplitude[degree, None] * grid.harmonics(LIGHT_ORDER) * np.sqrt(grid.solid_angles)
     return smooth.astype(np.float32), rest
+
+
+def _light_by_waves(grid: DirectionGrid) -> tuple[Doubles, float]:
+    """The same, (degree, wave, heights), for functions of the azimuth of norm 1."""
+    amplitude, rest = _amplitudes()
+    roots = np.sqrt(grid.solid_angles[:: grid.azimuths])
+    around = np.sqrt(grid.azimuths / np.where(np.arange(LIGHT_ORDER + 1) > 0, 2.0, 1.0))  # norms of cosines
+    smooth = amplitude[:, None, None] * grid.harmonics_by_height(LIGHT_ORDER) * around[:, None] * roots
+    return smooth, rest
+
+
+def _amplitudes() -> tuple[Doubles, float]:
+    """Roots of power per degree, without that of all higher ones, which white noise stands for; and this."""
+    rest = (LIGHT_ORDER + 2.0) ** -LIGHT_FALL
+    return np.sqrt((np.arange(LIGHT_ORDER + 1) + 1.0) ** -LIGHT_FALL - rest), rest
 
 
 def _factorise(matrix: Floats, light: tuple[Floats, float], terms: int, seed: int) -> tuple[Floats, Floats]:
