@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.darkness import unoccluded_squares
+from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -156,6 +157,16 @@ class PilotElements:
     def error_of(self, part: Halves, unit_albedo: Values) -> NDArray[np.float64]:
         """What a part's unit-albedo transport (k, t, channels) adds to the squared errors (k, t), without bias."""
         return self._squares(*(unit_albedo - part.values))
+
+    def errors_of_shares(self, part: FractionalVisibility) -> NDArray[np.float64]:
+        """Squared errors (k, t) of direct light by what the pilot's points see of texels."""
+        places = np.repeat(np.arange(len(self.vertices)), self.texels.shape[1])
+        ours = part.elements(places, self.texels.ravel()).reshape(*self.texels.shape, 1)
+        return self.error_of(self.direct, ours)
+
+    def squared_error_of_shares(self, part: FractionalVisibility) -> float:
+        """That of direct light, over the squared norm of the matrix."""
+        return max(self.relative_square(self.errors_of_shares(part)), 0.0)
 
     def weighted(self, squares: Values) -> NDArray[np.float64]:
         """Squares (k, t, channels) of unit-albedo transport as those of T, (k, t), summed over channels."""

@@ -27,7 +27,7 @@ from mi_sparse_prt.reconstruction.gather_noise import GatherNoise
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.solvers.adaptive_strata import adaptive_visibility
+from mi_sparse_prt.solvers.adaptive_strata import Strata, adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.glossy_radiosity import GatherEffort, glossy_indirect
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -38,8 +38,6 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 from mi_sparse_prt.solvers.term_paths import TermPaths
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.transport import LightTransport
-
-STRATA = 4  # per axis of a texel that is seen in part, where a plan does not say
 
 
 class Execution:
@@ -67,7 +65,7 @@ class Execution:
     ) -> None:
         self._problem, self._solver = direct.problem, direct
         self._settings, self._any_indirect, self._run = settings, indirect, run
-        self._direct: dict[tuple[str, int | None], MethodResult] = {}
+        self._direct: dict[tuple[str, Strata | None], MethodResult] = {}
         self._specular, self._specular_rays = specular, 0 if specular is None else specular.rays
 
     def parts(self, plan: Plan) -> MethodResult:
@@ -106,7 +104,7 @@ class Execution:
             case "edges":
                 return self._edges()
             case "adaptive":
-                return self._adaptive(plan.strata or STRATA)
+                return self._adaptive(plan.strata or Strata())
         return self._consensus()
 
     def _with_terms(self, light: MethodResult) -> MethodResult:
@@ -140,7 +138,7 @@ class Execution:
             part, rays = fractional_visibility(solver, centres.direct.bits)
         return replace(centres, direct=part, rays={"direct": centres.rays["direct"] + rays})
 
-    def _adaptive(self, strata: int) -> MethodResult:
+    def _adaptive(self, strata: Strata) -> MethodResult:
         """Strata of all texels, more of those that are seen in part."""
         elements = len(self._solver.points) * self._solver.lighting.n_directions
         with self._run.clock.phase("direct"):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mi_sparse_prt.core.errors import PrtError
+from mi_sparse_prt.solvers.adaptive_strata import Strata
 
 DIRECT = ("exact", "consensus", "edges", "adaptive", "sparse", "huang2010")
 INDIRECT = ("none", "gather", "sparse", "paths", "huang2010")
@@ -28,7 +29,7 @@ class Plan:
     direct : {"exact", "consensus", "edges", "adaptive", "sparse", "huang2010"}
         Rays for every element above the horizon; rays where neighbouring vertices disagree
         (``methods.consensus_visibility``); a ray for every texel's centre, and more along edges of visibility
-        (``solvers.texel_edges``); four rays in every texel, and more where these disagree
+        (``solvers.texel_edges``); one or four rays in every texel, and more where these disagree
         (``solvers.adaptive_strata``); or as the method of that name does. ``"exact"`` is for both bases, ``"edges"``
         and ``"adaptive"`` for the texel basis, the others are for the direction basis.
     indirect : {"none", "gather", "sparse", "paths", "huang2010"}
@@ -43,8 +44,8 @@ class Plan:
     resolution, spp : int, optional
         Of ``"paths"``: texels along an edge of the indirect light's cubemap, and paths per element (also of
         ``"sparse"`` and ``"huang2010"``). If not given, those of ``precompute``.
-    strata : int, optional
-        Of ``"adaptive"``: rays per axis in texels that are seen in part, 4 if not given.
+    strata : Strata, optional
+        Of ``"adaptive"``: rays per axis in all texels, and in those that are seen in part; 2 and 4 if not given.
 
     Raises
     ------
@@ -60,7 +61,7 @@ class Plan:
     dense: float | None = None
     resolution: int | None = None
     spp: int | None = None
-    strata: int | None = None
+    strata: Strata | None = None
 
     def __post_init__(self) -> None:
         for what, value, known in (
@@ -69,8 +70,8 @@ class Plan:
         ):
             if value not in known:
                 raise PrtError(f"plan: unknown {what} {value!r}; choose one of: {', '.join(known)}")
-        if self.strata is not None and self.strata < 1:
-            raise PrtError(f"plan: strata is {self.strata}; it must be at least 1, or left out")
+        if self.strata is not None and min(self.strata) < 1:
+            raise PrtError(f"plan: {self.strata}: both must be at least 1")
         if (self.direct in TOGETHER or self.indirect in TOGETHER) and self.direct != self.indirect:
             raise PrtError(
                 f"plan: {self.direct!r} direct light does not go with {self.indirect!r} indirect light; "
@@ -81,7 +82,10 @@ class Plan:
     def parameters(self) -> dict[str, Any]:
         """Those that this plan depends on."""
         names = PARAMETERS[self.indirect] + (("strata",) if self.direct == "adaptive" else ())
-        return {name: getattr(self, name) for name in names}
+        found = {name: getattr(self, name) for name in names}
+        if self.strata is not None and "strata" in found:
+            found["strata"] = self.strata._asdict()
+        return found
 
     def report(self) -> dict[str, Any]:
         """As JSON has it."""

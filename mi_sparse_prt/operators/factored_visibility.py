@@ -1,7 +1,8 @@
 """Direct light of glossy points, one row for each term of their BRDF; visibility is that of the point.
 
 ``T_k(x, j) = f_k(w_j in the frame of x) V(x, w_j) d_omega_j`` ([HR10] eq. 3), f_k of either sign. In the texel basis V
-is the visible share of the texel, and f_k that of its centre.
+is the visible share of the texel, and f_k that of its centre. Of a texel that the horizon cuts, only the part above it
+counts, and the height of that: many lobes are brightest near the horizon, where irradiance is next to nothing.
 """
 
 from __future__ import annotations
@@ -77,6 +78,11 @@ class FactoredVisibility(Operator):
         return frames(self.tangents[self.glossy], self.visibility.normals[self.glossy])
 
     @cached_property
+    def _texels(self) -> Floats:
+        """Directions of texels and how far heights within them are from theirs, at most, (m, 4)."""
+        return np.column_stack([self.lighting.directions, self.visibility.falloffs]).astype(np.float32)
+
+    @cached_property
     def _padded(self) -> Floats:
         """Tables with as many terms as vector instructions take."""
         return np.pad(self.tables, ((0, 0), (0, 0), (0, 0), (0, -self.terms % LANES)))
@@ -106,7 +112,7 @@ class FactoredVisibility(Operator):
         result[diffuse] = self.visibility.elements(ids[diffuse], texels[diffuse])
         which, term = np.divmod(ids[~diffuse] - len(self.material), self.terms)
         asked = texels[~diffuse].astype(np.int64)
-        directions, power = self.lighting.directions[asked], self.lighting.solid_angles[asked]
+        directions, power = self._texels[asked], self.lighting.solid_angles[asked]
         places = asked, directions, power.astype(np.float32), term
         found = np.empty(len(which), np.float32)
         run_in_parts(_single, len(which), self.visibility.seen, self._points(which), *places, found)
@@ -127,7 +133,7 @@ class FactoredVisibility(Operator):
         return values.reshape(len(self.glossy) * self.terms, len(texels))
 
     def relight(self, lighting: Floats) -> Floats:
-        directions = np.ascontiguousarray(self.lighting.directions.T)
+        directions = np.ascontiguousarray(self._texels.T)
         power = (lighting * self.lighting.solid_angles[:, None]).astype(np.float32)
         terms = np.empty((len(self.glossy), self.terms, 3), np.float32)
         run_in_parts(_relit, len(terms), self.visibility.seen, self._points(), directions, power, terms)
@@ -135,7 +141,7 @@ class FactoredVisibility(Operator):
 
     def combined(self, words: NDArray[np.integer], signs: Floats) -> Floats:
         texels = words[:, None] * signs.shape[1] + np.arange(signs.shape[1])
-        directions = np.ascontiguousarray(np.moveaxis(self.lighting.directions[texels], 2, 1))
+        directions = np.ascontiguousarray(np.moveaxis(self._texels[texels], 2, 1))
         power = (signs * self.lighting.solid_angles[texels]).astype(np.float32)
         place = np.full(-(-self.lighting.n_directions // signs.shape[1]), -1)
         place[words] = np.arange(len(words))
@@ -191,7 +197,7 @@ class FactoredVisibility(Operator):
 
     def _term_values(self, which: Ids, texels: Ids) -> Floats:
         """Terms (n, K, m) of some glossy points at some texels."""
-        directions = np.ascontiguousarray(self.lighting.directions[texels].T)
+        directions = np.ascontiguousarray(self._texels[texels].T)
         power = self.lighting.solid_angles[texels].astype(np.float32)
         asked = np.asarray(texels, np.int64)
         points = self._points(which)
@@ -237,16 +243,20 @@ class RowSelection(Operator):
 
 @numba.njit(fastmath=True, inline="always")
 def _add(
-    total: Floats, place: int, table: Floats, frame: Floats, u: Any, v: Any, w: Any, weight: Any
+    total: Floats, place: int, table: Floats, frame: Floats, u: Any, v: Any, w: Any, spread: Any, weight: Any
 ) -> None:
     """Add weight times the values of a table (size, size, K) in direction (u, v, w), turned by a frame.
+
+    Of heights evenly around its own, as far as ``spread``, those above the horizon.
 
     To total[place], whose length K is a multiple of LANES: loops of known length become vector instructions.
     """
     one, size = np.float32(1), table.shape[0]
     z = frame[2, 0] * u + frame[2, 1] * v + frame[2, 2] * w
+    least, most = max(z - spread, np.float32(0)), max(z + spread, np.float32(0))
+    weight = weight * min(max(np.float32(0.5) * (one + z / spread), np.float32(0)), one)
     half = np.float32(0.5 * (size - 1))
-    scale = half / (one + max(z, np.float32(0)))
+    scale = half / (one + np.float32(0.5) * (least + most))
     a = (frame[0, 0] * u + frame[0, 1] * v + frame[0, 2] * w) * scale + half
     b = (frame[1, 0] * u + frame[1, 1] * v + frame[1, 2] * w) * scale + half
     column, row = min(max(int(a), 0), size - 2), min(max(int(b), 0), size - 2)
@@ -275,7 +285,7 @@ def _expanded(
     power: Floats,
     result: Floats,
 ) -> None:
-    """Terms (n, terms, m) at texels (m,), whose directions are (3, m)."""
+    """Terms (n, terms, m) at texels (m,), whose directions and spreads are (4, m)."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     value, terms = np.empty((1, tables.shape[3]), np.float32), result.shape[1]
     for i in range(start, end):
@@ -291,9 +301,9 @@ def _expanded(
                 for k in range(terms):
                     result[i, k, j] = 0
                 continue
-            u, v, w = directions[0, j], directions[1, j], directions[2, j]
+            u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, weight)
             for k in range(terms):
                 result[i, k, j] = value[0, k]
 
@@ -310,7 +320,7 @@ def _single(
     term: NDArray[np.int64],
     result: Floats,
 ) -> None:
-    """One term (m,) at one texel each, whose directions are (m, 3)."""
+    """One term (m,) at one texel each, whose directions and spreads are (m, 4)."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
     value = np.empty((1, tables.shape[3]), np.float32)
     for i in range(start, end):
@@ -323,8 +333,8 @@ def _single(
         if weight == 0:
             continue
         value[:] = 0
-        u, v, w = directions[i, 0], directions[i, 1], directions[i, 2]
-        _add(value, 0, tables[materials[i]], frames[i], u, v, w, weight)
+        u, v, w, h = directions[i, 0], directions[i, 1], directions[i, 2], directions[i, 3]
+        _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, weight)
         result[i] = value[0, term[i]]
 
 
@@ -347,18 +357,18 @@ def _relit(
         for j in range(directions.shape[1]):
             if (bits[vertices[i], j // 32] >> np.uint32(j % 32)) & np.uint32(1) == 0:
                 continue
-            u, v, w = directions[0, j], directions[1, j], directions[2, j]
+            u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, np.float32(1))
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, np.float32(1))
             for c in range(3):
                 for k in range(tables.shape[3]):
                     total[c, k] += value[0, k] * power[j, c]
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = listed[e]
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
-            u, v, w = directions[0, j], directions[1, j], directions[2, j]
+            u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, more)
+            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, more)
             for c in range(3):
                 for k in range(tables.shape[3]):
                     total[c, k] += value[0, k] * power[j, c]
@@ -379,7 +389,8 @@ def _combined(
     power: Floats,
     result: Floats,
 ) -> None:
-    """Sums (n, terms, b) over words of the terms at their bits; directions (words, 3, b), power (words, b).
+    """Sums (n, terms, b) over words of the terms at their bits; directions and spreads (words, 4, b), power
+    (words, b).
 
     ``place`` says where among ``words`` a word is, or -1.
     """
@@ -395,16 +406,21 @@ def _combined(
             for b in range(width):
                 if (mask >> np.uint32(b)) & np.uint32(1) == 0:
                     continue
-                u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
-                _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b])
+                u, v, w, h = (
+                    directions[g, 0, b],
+                    directions[g, 1, b],
+                    directions[g, 2, b],
+                    directions[g, 3, b],
+                )
+                _add(total, b, tables[materials[i]], frames[i], u, v, w, h, power[g, b])
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = int(listed[e])
             g, b = place[j // width], j % width
             if g < 0:
                 continue
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
-            u, v, w = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b]
-            _add(total, b, tables[materials[i]], frames[i], u, v, w, power[g, b] * more)
+            u, v, w, h = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b], directions[g, 3, b]
+            _add(total, b, tables[materials[i]], frames[i], u, v, w, h, power[g, b] * more)
         for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
                 result[i, k, c] = total[c, k]

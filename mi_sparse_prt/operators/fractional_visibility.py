@@ -63,6 +63,11 @@ class FractionalVisibility(Operator):
         return self.bits, self.starts, self.texels, self.shares
 
     @property
+    def falloffs(self) -> Floats:
+        """(n_directions,), how far n . w within a texel is from its mean, about, for normals at right angles to it."""
+        return _means(self.lighting.resolution)[1][: self.lighting.n_directions]
+
+    @property
     def edges(self) -> Bits | None:
         return self.bits
 

@@ -56,6 +56,11 @@ class Visibility(Operator):
         return self.bits, starts, read_only(np.zeros(0, np.uint16)), read_only(np.zeros(0, np.uint8))
 
     @property
+    def falloffs(self) -> Floats:
+        """As of ``FractionalVisibility``; next to nothing, as light comes from the centres of texels."""
+        return np.full(self.lighting.n_directions, 1e-6, np.float32)
+
+    @property
     def edges(self) -> Bits | None:
         return self.bits
 

@@ -11,7 +11,6 @@ from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import (
-    MINIMUM_GAIN,
     Costs,
     Predicted,
     better,
@@ -24,7 +23,9 @@ from mi_sparse_prt.planner.choice import (
     weighed,
     with_direct,
 )
+from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN
 from mi_sparse_prt.planner.texel_shares import TexelShares
+from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 ATTEMPTS = 4
@@ -219,7 +220,7 @@ class CandidatePlans:
         return [p.report(p.plan in tried) for p in sorted(unique, key=lambda p: p.seconds)]
 
 
-def _light(plan: Plan) -> tuple[str, int | None]:
+def _light(plan: Plan) -> tuple[str, Strata | None]:
     """How direct light is found."""
     return plan.direct, plan.strata
 

@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 from mi_sparse_prt.estimation.held_out import ROUND, HeldOutError
 from mi_sparse_prt.methods.plan import DENSE, GATHER, Plan
 from mi_sparse_prt.methods.settings import TARGET
-from mi_sparse_prt.planner.direct_costs import DirectCost
+from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN, DirectCost
 from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
 from mi_sparse_prt.planner.sparse_costs import SparseCosts
@@ -23,7 +23,6 @@ SPREAD = 0.18  # root mean square of how far predicted errors are from those fou
 SAFE = 1.2  # by what factor a plan for after a miss is below the target: that miss tells how far off predictions are
 WORST_FACTOR = 2.0  # by what factor predictions may be off where they are worst
 STANDARD_ERROR = 0.07  # relative standard error of what a round of held-out elements finds; a typical one
-MINIMUM_GAIN = 0.9  # of an error is better
 ALIKE = 1.03  # times as long is as quick: predictions of time tell no more, and then the most exact is taken
 FIRST_SHARE = (
     0.1  # of the time of the plan to choose: what takes no more, and may be good enough, is tried first

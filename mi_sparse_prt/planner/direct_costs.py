@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,17 +15,17 @@ from mi_sparse_prt.core.bits import Bits, count_bits, list_bits, unpack
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
-from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.adaptive_strata import ACROSS, adaptive_visibility
+from mi_sparse_prt.solvers.adaptive_strata import ACROSS, FIRST, Strata, adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
 from mi_sparse_prt.solvers.walls import Walls
 
+MINIMUM_GAIN = 0.9  # of an error is better
 PATCH = 512  # vertices, next to each other
 PATCHES = 8  # in all, or one for each mesh
 INNER = 4  # one in so many vertices of a patch is judged: the middle ones, which have all their neighbours
@@ -43,7 +44,7 @@ class DirectCost:
     seconds: float
     error: float
     centres: float = 0.0
-    strata: int | None = None
+    strata: Strata | None = None
 
     @property
     def with_known_centres(self) -> DirectCost:
@@ -73,49 +74,53 @@ def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     start = time.perf_counter()
     fractional_visibility(some, bits)
     edges = (time.perf_counter() - start) * len(direct.points) / len(bits)
-    return DirectCost(centres + edges, math.sqrt(_squared_error(part, held)), centres)
+    return DirectCost(centres + edges, math.sqrt(held.squared_error_of_shares(part)), centres)
 
 
 def edges_error(direct: DirectSolver, held: PilotElements) -> float:
     """That of ``edges_cost``, which takes a small part of its time."""
     some = DirectSolver(replace(_few(direct, held), basis="direction"))
     bits = some.rows(np.arange(len(held.vertices))).astype(np.uint32, copy=False)
-    return math.sqrt(_squared_error(fractional_visibility(some, bits)[0], held))
+    return math.sqrt(held.squared_error_of_shares(fractional_visibility(some, bits)[0]))
 
 
 def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: int) -> DirectCost:
-    """Strata of all texels, and as many of those that are seen in part as an error takes; the most, if none is enough.
+    """Strata that an error takes, with the fewest rays; of about the most exact ones, if none are enough.
 
-    The squared error is that of texels that seem to be seen as a whole, and one that falls as ``strata**-3``; seconds
-    grow as ``strata**2``. Two numbers of strata tell both.
+    Lobes that change within texels leave an error that no strata take away.
+
+    The squared error is that of texels that seem to be seen as a whole, and one that falls as ``across**-3``; rays grow
+    as ``across**2``. Two numbers of strata tell both.
     """
-    few, seconds, squares = _few(direct, held), [], []
-    adaptive_visibility(few, ACROSS[0], seed)  # may compile kernels
+    few, costs = _few(direct, held), list[DirectCost]()
+    for first in FIRST:
+        costs += _strata_costs(few, held, first, seed)
+    good = max(aim, min(cost.error for cost in costs) / MINIMUM_GAIN)
+    best = min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
+    return replace(best, seconds=best.seconds * len(direct.points) / len(held.vertices))
+
+
+def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> Iterator[DirectCost]:
+    """Of a pilot's points. The last rays say what one costs: they are most, and no kernel is compiled for them."""
+    rays, squares, seconds = [], [], 0.0
     for across in (ACROSS[0], ACROSS[-1]):
         start = time.perf_counter()
-        part, _ = adaptive_visibility(few, across, seed)
-        seconds.append((time.perf_counter() - start) * len(direct.points) / len(held.vertices))
-        squares.append(_squared_error(part, held))
-    of_error, of_seconds = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
-    fall = max(squares[0] - squares[1], 0.0) / (of_error[0] - of_error[-1])
-    errors = np.sqrt(fall * of_error + max(squares[1] - fall * of_error[-1], 0.0))
-    rise = max(seconds[1] - seconds[0], 0.0) / (of_seconds[-1] - of_seconds[0])
-    k = int(np.argmax(errors <= aim)) if errors[-1] <= aim else len(ACROSS) - 1
-    return DirectCost(
-        float(seconds[0] + rise * (of_seconds[k] - of_seconds[0])), float(errors[k]), strata=ACROSS[k]
-    )
+        part, traced = adaptive_visibility(few, Strata(first, across), seed)
+        seconds = (time.perf_counter() - start) / max(traced, 1)
+        rays.append(traced)
+        squares.append(held.squared_error_of_shares(part))
+    falls, grows = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
+    fall = max(squares[0] - squares[1], 0.0) / (falls[0] - falls[-1])
+    rise = (rays[1] - rays[0]) / (grows[-1] - grows[0])
+    for across, falling, growing in zip(ACROSS, falls, grows, strict=True):
+        square = fall * falling + max(squares[1] - fall * falls[-1], 0.0)
+        traced = rays[0] + rise * (growing - grows[0])
+        yield DirectCost(float(seconds * traced), math.sqrt(square), strata=Strata(first, across))
 
 
 def _few(direct: DirectSolver, held: PilotElements) -> Problem:
     """The problem at the points of a pilot."""
     return direct.problem.at(points_at(direct.points, held.vertices))
-
-
-def _squared_error(part: FractionalVisibility, held: PilotElements) -> float:
-    """Of direct light at a pilot's points, over the squared norm of the matrix."""
-    places = np.repeat(np.arange(len(held.vertices)), held.texels.shape[1])
-    ours = part.elements(places, held.texels.ravel()).reshape(*held.texels.shape, 1)
-    return max(held.relative_square(held.error_of(held.direct, ours)), 0.0)
 
 
 def points_at(points: Points, ids: NDArray[np.integer]) -> Points:

@@ -8,7 +8,8 @@ from dataclasses import replace
 from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.choice import MARGIN, MINIMUM_GAIN
+from mi_sparse_prt.planner.choice import MARGIN
+from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN
 from mi_sparse_prt.reconstruction.specular_noise import SpecularNoise
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularLight, SpecularSearch

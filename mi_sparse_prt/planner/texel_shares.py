@@ -7,10 +7,12 @@ from dataclasses import replace
 from functools import cached_property
 
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.term_pilot import TermPilot
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
-from mi_sparse_prt.planner.direct_costs import adaptive_cost, edges_error
+from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN, adaptive_cost, edges_error
+from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -37,14 +39,17 @@ class TexelShares:
         self._direct, self._settings = direct, settings
 
     def of(self, plan: Plan) -> Plan:
-        """The plan, with adaptive strata if edges miss its tolerance, or what a target has room for, and these less."""
+        """The plan, with adaptive strata if edges miss its tolerance, or what a target has room for, and these do less.
+
+        Clearly less: lobes that change within texels have errors that no strata take away.
+        """
         settings = self._settings
         room = math.inf if settings.target_error is None else MARGIN * settings.target_error / math.sqrt(2)
         aim = min(plan.tolerance, room)
         if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= aim:
             return plan
         cost = adaptive_cost(self._direct, self._held, aim, settings.seed)
-        better = cost.error < self._of_edges and cost.seconds < settings.max_seconds / 2
+        better = cost.error <= MINIMUM_GAIN * self._of_edges and cost.seconds < settings.max_seconds / 2
         return replace(plan, direct="adaptive", strata=cost.strata) if better else plan
 
     @cached_property
@@ -57,9 +62,11 @@ class TexelShares:
             count = max(1, POINTS // len(strata))
         else:
             count = max(1, POINTS // (len(strata) * TOGETHER))
+        if isinstance(problem.reflection, InOutFactors):
+            return TermPilot(problem, self._settings.seed, count, TEXELS)
         return PilotElements(problem, False, self._settings.seed, count, TEXELS)
 
     @cached_property
     def _of_edges(self) -> float:
-        """Their error, relative to direct light."""
+        """Their error, relative to direct light; of glossy surfaces, in what these make of it."""
         return edges_error(self._direct, self._held)

@@ -6,6 +6,8 @@ cut it more than once; there the error of strata falls as their number to the po
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +20,43 @@ from mi_sparse_prt.operators.fractional_visibility import FULL, FractionalVisibi
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 
-FIRST = 2  # strata per axis of every texel
+FIRST = (1, 2)  # strata per axis of every texel: those of a pilot
 ACROSS = (3, 4, 6, 8)  # of those of which one beside is not seen alike
 ELEMENTS = 1 << 22  # at a time
-ALIKE = (
-    FULL // 5
-)  # shares that differ by less: those of FIRST**2 rays do by more, unless the horizon weighs them
-SINGLE = 0.3 * FULL  # more than one of FIRST**2 rays can be
+# shares that differ by less: those of four rays do by more, unless the horizon weighs them
+ALIKE = FULL // 5
+SINGLE = 1.2  # times the share of one ray is more than one
 ADAPTIVE = 14  # spawn key
 MISSED = 0.005  # of the light of a point, which may be where no ray has found any
 
 Shares = NDArray[np.int16]
 
 
-def adaptive_visibility(problem: Problem, across: int, seed: int) -> tuple[FractionalVisibility, int]:
+class Strata(NamedTuple):
+    """Strata per axis of a texel, each with a ray.
+
+    Attributes
+    ----------
+    first : int
+        Of all texels. One is enough where what is seen in part is seldom narrower than texels.
+    across : int
+        Of those that are seen in part, or of which one beside is not seen alike. Of points whose light comes through
+        what is far finer than texels, all texels have so many: what no ray has found is as much as what one ray alone
+        has found (Good 1953).
+    """
+
+    first: int = 2
+    across: int = 4
+
+
+def adaptive_visibility(problem: Problem, strata: Strata, seed: int) -> tuple[FractionalVisibility, int]:
     """Visible shares of all texels, from strata of these.
 
     Parameters
     ----------
     problem : Problem
         In the texel basis.
-    across : int
-        Strata per axis of texels that are seen in part, or of which one beside is not seen alike. Of points whose
-        light comes through what is far finer than texels, all texels have so many: what no ray has found is as much as
-        what one ray alone has found (Good 1953).
+    strata : Strata
     seed : int
 
     Returns
@@ -57,7 +72,7 @@ def adaptive_visibility(problem: Problem, across: int, seed: int) -> tuple[Fract
     lighting, points = problem.emission, problem.points
     size, step = lighting.n_directions, max(1, ELEMENTS // lighting.n_directions)
     seeds = element_seeds(random_stream(seed, ADAPTIVE), 2)
-    first, second = (DirectSolver(problem, *one) for one in zip((FIRST, across), seeds, strict=True))
+    first, second = (DirectSolver(problem, *one) for one in zip(strata, seeds, strict=True))
     near = np.ascontiguousarray(np.hstack([lighting.sides.tables.beside, lighting.sides.tables.across]))
     blocks, rays = [], 0
     for a in range(0, max(len(points), 1), step):
@@ -65,9 +80,9 @@ def adaptive_visibility(problem: Problem, across: int, seed: int) -> tuple[Fract
         shares = first.shares(np.repeat(ids, size), np.tile(np.arange(size, dtype=np.uint32), len(ids)))
         shares = shares.reshape(len(ids), size)
         mixed = np.zeros(shares.shape, np.bool_)
-        run_in_parts(_mark_mixed, len(ids), shares, near, mixed)
+        run_in_parts(_mark_mixed, len(ids), strata.first, shares, near, mixed)
         row, texel = np.nonzero(mixed)
-        rays += FIRST**2 * int((shares >= 0).sum()) + across**2 * len(row)
+        rays += strata.first**2 * int((shares >= 0).sum()) + strata.across**2 * len(row)
         shares[row, texel] = second.shares(ids[row], texel.astype(np.uint32))
         blocks.append(_listed(shares))
     seen, number, texels, parts = (np.concatenate(column) for column in zip(*blocks, strict=True))
@@ -89,6 +104,7 @@ def _listed(
 def _mark_mixed(
     first: int,
     last: int,
+    across: int,
     shares: Shares,
     near: NDArray[np.int32],
     mixed: NDArray[np.bool_],
@@ -108,7 +124,7 @@ def _mark_mixed(
             most = max(own, others)
             mixed[i, t] = most - least > ALIKE
             total += own / FULL
-            single += 0 < own < SINGLE and others == 0
-        if single / FIRST**2 > MISSED * total:
+            single += 0 < own * across**2 < SINGLE * FULL and others == 0
+        if single / across**2 > MISSED * total:
             for t in range(shares.shape[1]):
                 mixed[i, t] = shares[i, t] >= 0

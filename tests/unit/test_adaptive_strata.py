@@ -15,7 +15,7 @@ from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.planner.direct_costs import adaptive_cost, points_at
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import adaptive_strata
-from mi_sparse_prt.solvers.adaptive_strata import ACROSS, adaptive_visibility
+from mi_sparse_prt.solvers.adaptive_strata import ACROSS, Strata, adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -53,12 +53,13 @@ def error_of(ours: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(((ours - x) * (ours - y)).sum() / (x * y).sum()))
 
 
-def test_few_rays_where_little_is_seen_in_part():
+@pytest.mark.parametrize("first", [1, 2])
+def test_few_rays_where_little_is_seen_in_part(first):
     """One board above the floor: less than half of the rays of 6 x 6 strata everywhere, for 1.25 times its error."""
     board = {"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5), "to_world": T().translate([0, 0, 2])}
     problem = floor_of(build(0.4, floor={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)}, board=board))
     x, y = (rows(problem, 16, seed) for seed in (101, 102))
-    found, rays = adaptive_visibility(problem, 6, 5)
+    found, rays = adaptive_visibility(problem, Strata(first, 6), 5)
     ours = found.rows(np.arange(len(problem.points)))[..., 0]
     assert error_of(ours, x, y) < 1.25 * error_of(rows(problem, 6, 7), x, y)
     assert rays < 6**2 * x.size / 4
@@ -73,7 +74,7 @@ def test_as_exact_as_strata_everywhere(gap, across):
     """
     problem = floor_of(under_slats(0.6, gap))
     x, y = (rows(problem, 16, seed) for seed in (101, 102))
-    found, _ = adaptive_visibility(problem, across, 5)
+    found, _ = adaptive_visibility(problem, Strata(across=across), 5)
     ours = found.rows(np.arange(len(problem.points)))[..., 0]
     exact, few = (error_of(rows(problem, strata, 7), x, y) for strata in (across, 2))
     assert error_of(ours, x, y) < 1.25 * exact
@@ -81,7 +82,8 @@ def test_as_exact_as_strata_everywhere(gap, across):
     assert ours.sum() == pytest.approx((x + y).sum() / 2, rel=0.01)
 
 
-def test_light_through_narrow_gaps_is_not_lost():
+@pytest.mark.parametrize("first", [1, 2])
+def test_light_through_narrow_gaps_is_not_lost(first):
     """
     Scenario: gaps of 1% of the slats: a texel and those around it have one of 36 rays in a gap, or none.
     Expected: all light that arrives, within four standard errors of independent runs, and these within 2%.
@@ -89,7 +91,9 @@ def test_light_through_narrow_gaps_is_not_lost():
     problem = floor_of(under_slats(0.6, 0.01))
     truth = np.mean([rows(problem, 24, seed).sum() for seed in range(101, 105)])
     sums = [
-        adaptive_visibility(problem, 6, 10 * seed)[0].rows(np.arange(len(problem.points))).sum()
+        adaptive_visibility(problem, Strata(first, 6), 10 * seed)[0]
+        .rows(np.arange(len(problem.points)))
+        .sum()
         for seed in range(12)
     ]
     error = np.std(sums, ddof=1) / np.sqrt(len(sums))
@@ -99,34 +103,36 @@ def test_light_through_narrow_gaps_is_not_lost():
 
 def test_the_same_for_any_block_of_points(monkeypatch):
     problem = floor_of(under_slats(0.6, 0.5))
-    whole, rays = adaptive_visibility(problem, 3, 1)
+    whole, rays = adaptive_visibility(problem, Strata(across=3), 1)
     monkeypatch.setattr(adaptive_strata, "ELEMENTS", 7 * LIGHTING.n_directions)
-    parts, as_many = adaptive_visibility(problem, 3, 1)
+    parts, as_many = adaptive_visibility(problem, Strata(across=3), 1)
     assert rays == as_many
     for name in ("bits", "starts", "texels", "shares"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
-    other, _ = adaptive_visibility(problem, 3, 2)
+    other, _ = adaptive_visibility(problem, Strata(across=3), 2)
     assert not np.array_equal(whole.shares, other.shares)
 
 
 def test_no_strata_are_refused():
-    with pytest.raises(prt.PrtError, match="strata is 0"):
-        Plan("adaptive", strata=0)
+    with pytest.raises(prt.PrtError, match=r"Strata\(first=2, across=0\): both must be at least 1"):
+        Plan("adaptive", strata=Strata(across=0))
 
 
 def test_no_points():
     problem = floor_of(under_slats(0.6, 0.5))
     none = problem.at(Points(*(x[:0] for x in vars(problem.points).values())))
-    found, rays = adaptive_visibility(none, 3, 1)
+    found, rays = adaptive_visibility(none, Strata(across=3), 1)
     assert found.shape == (0, LIGHTING.n_directions, 1) and rays == 0
 
 
 def test_below_the_horizon_nothing_is_seen():
     """A floor without anything above: shares of texels that the horizon cuts are those of their part above it."""
     problem = floor_of(build(0.5, floor={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)}))
-    found, rays = adaptive_visibility(problem, 4, 1)
+    found, rays = adaptive_visibility(problem, Strata(across=4), 1)
     ours, truth = found.rows(np.arange(len(problem.points)))[..., 0], rows(problem, 16, 3)
     assert np.abs(ours - truth).max() < 0.02 * truth.max()
+    one, fewer = adaptive_visibility(problem, Strata(1, 4), 1)
+    assert np.array_equal(one.bits, found.bits) and fewer == rays / 4
     assert rays == 4 * (len(problem.points) * LIGHTING.n_directions) // 2
 
 
@@ -137,9 +143,9 @@ def test_light_that_passes_slats_is_not_in_their_way():
     problem = replace(problem_at(scene, LIGHTING, basis="texel"), specular_apart=True)
     inside = np.arange(scene.meshes[0].vertices.start, scene.meshes[0].vertices.stop)
     problem = problem.at(points_at(problem.points, inside))
-    found, _ = adaptive_visibility(problem, 3, 1)
+    found, _ = adaptive_visibility(problem, Strata(across=3), 1)
     open_floor = floor_of(build(0.4, floor={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)}))
-    truth = adaptive_visibility(open_floor, 3, 1)[0].rows(np.arange(len(inside)))
+    truth = adaptive_visibility(open_floor, Strata(across=3), 1)[0].rows(np.arange(len(inside)))
     assert found.rows(np.arange(len(inside))).sum() == pytest.approx(truth.sum(), rel=1e-3)
 
 
@@ -152,11 +158,11 @@ def test_strata_that_a_pilot_chooses():
     direct = DirectSolver(problem_at(scene, LIGHTING, basis="texel"))
     held = PilotElements(direct.problem, False, 0, 192, 32)
     costs = [adaptive_cost(direct, held, aim, 0) for aim in (0.5, 0.012, 1e-6)]
-    assert costs[0].strata == ACROSS[0] and costs[-1].strata == ACROSS[-1]
+    assert costs[0].strata == Strata(1, ACROSS[0]) and costs[-1].strata == Strata(2, ACROSS[-1])
     assert costs[0].error > costs[1].error >= costs[2].error
     for cost in costs:
         assert cost.strata is not None
         plan = Plan("adaptive", strata=cost.strata)
         found = prt.precompute(scene, LIGHTING, plan, "texel", max_depth=2, progress=False)
-        assert found.report["plan"]["parameters"] == {"strata": cost.strata}
+        assert found.report["plan"]["parameters"] == {"strata": cost.strata._asdict()}
         assert cost.error == pytest.approx(found.report["estimated_error"]["total"], rel=0.25)

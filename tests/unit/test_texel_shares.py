@@ -14,6 +14,7 @@ from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.candidates import RefinementSchedule
 from mi_sparse_prt.planner.texel_shares import TexelShares
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 LIGHTING = prt.CubemapLighting(8)
@@ -88,16 +89,18 @@ def test_finer_direct_light_may_be_worth_it_alone():
     Expected: with an error of direct light, a plan of adaptive strata follows one of edges, and none like it.
     """
 
-    class Strata:
+    class Shares:
         def of(self, plan: Plan) -> Plan:
             return (
-                plan if plan.rays == 64 else Plan("adaptive", "gather", plan.rays, plan.tolerance, strata=4)
+                plan
+                if plan.rays == 64
+                else Plan("adaptive", "gather", plan.rays, plan.tolerance, strata=Strata(2, 4))
             )
 
     parts = {"direct": 0.1, "indirect": 0.03}
     found = HeldOutError(math.hypot(*parts.values()), {}, {"total": 0.0}, 100, parts, [])
     plans = [Plan("edges", "gather", rays, tolerance) for rays, tolerance in GATHER]
-    schedule = RefinementSchedule(plans, shares=Strata())
+    schedule = RefinementSchedule(plans, shares=Shares())
     assert schedule.plan == plans[0]
     assert schedule.after(found, 4.0) and (schedule.plan.direct, schedule.plan.rays) == ("adaptive", 256)
     assert not schedule.after(found, 8.0)
