@@ -11,6 +11,7 @@ from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import (
+    MARGIN,
     Costs,
     Predicted,
     better,
@@ -44,6 +45,8 @@ class RefinementSchedule:
         Seconds before the first plan.
     shares : TexelShares, optional
         Chooses how direct light is found, of each plan when it is its turn.
+    target : float, optional
+        Relative L2 error: half of the rays of the next plan are enough where they are predicted to meet it.
 
     Attributes
     ----------
@@ -64,9 +67,10 @@ class RefinementSchedule:
         limit: float = math.inf,
         started: float = 0.0,
         shares: TexelShares | None = None,
+        target: float | None = None,
     ) -> None:
         first, *self._others = plans
-        self._shares = shares
+        self._shares, self._aim = shares, MARGIN * (target or 0.0)
         self.plan = self._with_shares(first)
         self._limit, self._started, self._error = limit, started, math.inf
 
@@ -78,23 +82,30 @@ class RefinementSchedule:
         """
         if not self._others:
             return False
-        before, following = self.plan, self._with_shares(self._others[0])
+        before = self.plan
+        following = finest = self._with_shares(self._others[0])
         if before.indirect == following.indirect == "gather":
-            more, same = following.rays / before.rays, _light(before) == _light(following)
-            refinable = min(found.parts.get("indirect", 0.0), of_rays)
-            square = found.total**2 - refinable**2 * (1 - 1 / more)
-            if not same:  # finer direct light comes as near as the plan's tolerance
-                square -= max(found.parts["direct"] ** 2 - following.tolerance**2, 0.0)
-            seconds = elapsed + more * (elapsed - self._started)
+            half = replace(following, rays=following.rays // 2, tolerance=math.sqrt(2) * following.tolerance)
+            if half.rays > before.rays and self._expected(half, found, of_rays) <= self._aim:
+                following = half
+            seconds = elapsed + following.rays / before.rays * (elapsed - self._started)
             # the most that more rays can do, and what they did last time
-            helped = max(
-                math.sqrt(max(square, 0.0)) / found.total, found.total / self._error if same else 0.0
-            )
+            did = found.total / self._error if _light(before) == _light(following) else 0.0
+            helped = max(self._expected(following, found, of_rays) / found.total, did)
             if helped > MINIMUM_GAIN or seconds > self._limit:
                 return False
-        self._others.pop(0)
+        if following is finest:
+            self._others.pop(0)
         self.plan, self._started, self._error = following, elapsed, found.total
         return True
+
+    def _expected(self, following: Plan, found: HeldOutError, of_rays: float) -> float:
+        """The least error that a plan of more rays may have, the present one having this one."""
+        refinable = min(found.parts.get("indirect", 0.0), of_rays)
+        square = found.total**2 - refinable**2 * (1 - self.plan.rays / following.rays)
+        if _light(self.plan) != _light(following):  # finer direct light comes as near as the plan's tolerance
+            square -= max(found.parts["direct"] ** 2 - following.tolerance**2, 0.0)
+        return math.sqrt(max(square, 0.0))
 
     def _with_shares(self, plan: Plan) -> Plan:
         return plan if self._shares is None else self._shares.of(plan)
@@ -256,4 +267,4 @@ def refinement_schedule(settings: Settings, started: float, direct: DirectSolver
     else:
         plans = [settings.with_shares(plan) for plan in EFFORTS.get(settings.method, (settings.plan,))]
     limit = settings.max_seconds if settings.method == "auto" else math.inf
-    return RefinementSchedule(plans, limit, started, shares)
+    return RefinementSchedule(plans, limit, started, shares, settings.target_error)

@@ -39,13 +39,13 @@ class TexelShares:
         self._direct, self._settings = direct, settings
 
     def of(self, plan: Plan) -> Plan:
-        """The plan, with adaptive strata if edges miss its tolerance, or what a target has room for, and these do less.
+        """The plan, with adaptive strata if edges miss what a target has room for, or its tolerance, and these do less.
 
         Clearly less: lobes that change within texels have errors that no strata take away.
         """
         settings = self._settings
-        room = math.inf if settings.target_error is None else MARGIN * settings.target_error / math.sqrt(2)
-        aim = min(plan.tolerance, room)
+        target = settings.target_error
+        aim = plan.tolerance if target is None else MARGIN * target / math.sqrt(2)  # half of its square
         if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= aim:
             return plan
         cost = adaptive_cost(self._direct, self._held, aim, settings.seed)

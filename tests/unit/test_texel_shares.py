@@ -110,3 +110,26 @@ def problem_of(scene: Scene):
     from conftest import problem_at
 
     return problem_at(scene, LIGHTING, basis="texel")
+
+
+def test_half_of_the_rays_may_do():
+    """
+    Rationale: a target that is missed by little takes few rays more, not four times as many.
+    Expected: half of the rays of the next plan, and the rank that belongs to them, where these are predicted to meet
+        the target; its own where not, or where there is no target; after half of them, all of them.
+    """
+    plans = [Plan("edges", "gather", rays, tolerance) for rays, tolerance in GATHER]
+
+    def schedule(target: float | None) -> RefinementSchedule:
+        return RefinementSchedule(plans, target=target)
+
+    def missed(indirect: float) -> HeldOutError:
+        parts = {"direct": 0.02, "indirect": indirect}
+        return HeldOutError(math.hypot(*parts.values()), {}, {"total": 0.0}, 100, parts, [])
+
+    near, far, open_ended = schedule(0.05), schedule(0.05), schedule(None)
+    assert near.after(missed(0.05), 4.0) and near.plan.rays == 128
+    assert near.plan.tolerance == pytest.approx(0.03 * math.sqrt(2))
+    assert near.after(missed(0.043), 9.0) and near.plan == plans[1]
+    assert far.after(missed(0.08), 4.0) and far.plan == plans[1]
+    assert open_ended.after(missed(0.05), 4.0) and open_ended.plan == plans[1]
