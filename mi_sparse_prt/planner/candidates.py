@@ -73,6 +73,7 @@ class RefinementSchedule:
         self._shares, self._aim = shares, MARGIN * (target or 0.0)
         self.plan = self._with_shares(first)
         self._limit, self._started, self._error = limit, started, math.inf
+        self._before: Plan | None = None
 
     def after(self, found: HeldOutError, elapsed: float, of_rays: float = math.inf) -> bool:
         """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
@@ -89,15 +90,21 @@ class RefinementSchedule:
             if half.rays > before.rays and self._expected(half, found, of_rays) <= self._aim:
                 following = half
             seconds = elapsed + following.rays / before.rays * (elapsed - self._started)
-            # the most that more rays can do, and what they did last time
-            did = found.total / self._error if _light(before) == _light(following) else 0.0
-            helped = max(self._expected(following, found, of_rays) / found.total, did)
-            if helped > MINIMUM_GAIN or seconds > self._limit:
+            left = self._expected(following, found, of_rays)
+            if _light(before) == _light(following):  # they do no more than they did last time
+                left = max(left, found.total / self._error * found.total, self._floor(found.total))
+            if left > MINIMUM_GAIN * found.total or seconds > self._limit:
                 return False
         if following is finest:
             self._others.pop(0)
+        self._before = before
         self.plan, self._started, self._error = following, elapsed, found.total
         return True
+
+    def _floor(self, error: float) -> float:
+        """What any number of rays would leave of the present plan's error, as the one before it tells."""
+        known = [] if self._before is None else [(self._before, self._error)]
+        return error_without_noise([*known, (self.plan, error)])
 
     def _expected(self, following: Plan, found: HeldOutError, of_rays: float) -> float:
         """The least error that a plan of more rays may have, the present one having this one."""
