@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,21 +91,25 @@ def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: i
     The squared error is that of texels that seem to be seen as a whole, and one that falls as ``across**-3``; rays grow
     as ``across**2``. Two numbers of strata tell both.
     """
-    few, costs = _few(direct, held), list[DirectCost]()
+    few, costs, each = _few(direct, held), list[DirectCost](), 0.0
     for first in FIRST:
-        costs += _strata_costs(few, held, first, seed)
+        some, each = _strata_costs(few, held, first, seed)
+        costs += some
     good = max(aim, min(cost.error for cost in costs) / MINIMUM_GAIN)
     best = min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
-    return replace(best, seconds=best.seconds * len(direct.points) / len(held.vertices))
+    return replace(best, seconds=best.seconds * each * len(direct.points) / len(held.vertices))
 
 
-def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> Iterator[DirectCost]:
-    """Of a pilot's points. The last rays say what one costs: they are most, and no kernel is compiled for them."""
-    rays, squares, seconds = [], [], 0.0
+def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> tuple[list[DirectCost], float]:
+    """Of a pilot's points, with rays in place of seconds; and seconds of a ray.
+
+    The last rays say what one takes: they are most, and no kernel is compiled for them.
+    """
+    rays, squares, each, costs = [], [], 0.0, []
     for across in (ACROSS[0], ACROSS[-1]):
         start = time.perf_counter()
         part, traced = adaptive_visibility(few, Strata(first, across), seed)
-        seconds = (time.perf_counter() - start) / max(traced, 1)
+        each = (time.perf_counter() - start) / max(traced, 1)
         rays.append(traced)
         squares.append(held.squared_error_of_shares(part))
     falls, grows = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
@@ -115,7 +118,8 @@ def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> I
     for across, falling, growing in zip(ACROSS, falls, grows, strict=True):
         square = fall * falling + max(squares[1] - fall * falls[-1], 0.0)
         traced = rays[0] + rise * (growing - grows[0])
-        yield DirectCost(float(seconds * traced), math.sqrt(square), strata=Strata(first, across))
+        costs.append(DirectCost(float(traced), math.sqrt(square), strata=Strata(first, across)))
+    return costs, each
 
 
 def _few(direct: DirectSolver, held: PilotElements) -> Problem:

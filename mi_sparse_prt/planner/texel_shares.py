@@ -11,7 +11,7 @@ from mi_sparse_prt.estimation.term_pilot import TermPilot
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
-from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN, adaptive_cost, edges_error
+from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN, DirectCost, adaptive_cost, edges_error
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -37,6 +37,7 @@ class TexelShares:
 
     def __init__(self, direct: DirectSolver, settings: Settings) -> None:
         self._direct, self._settings = direct, settings
+        self._costs: dict[float, DirectCost] = {}  # by what was aimed at
 
     def of(self, plan: Plan) -> Plan:
         """The plan, with adaptive strata if edges miss what a target has room for, or its tolerance, and these do less.
@@ -48,7 +49,9 @@ class TexelShares:
         aim = plan.tolerance if target is None else MARGIN * target / math.sqrt(2)  # half of its square
         if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= aim:
             return plan
-        cost = adaptive_cost(self._direct, self._held, aim, settings.seed)
+        if aim not in self._costs:
+            self._costs[aim] = adaptive_cost(self._direct, self._held, aim, settings.seed)
+        cost = self._costs[aim]
         better = cost.error <= MINIMUM_GAIN * self._of_edges and cost.seconds < settings.max_seconds / 2
         return replace(plan, direct="adaptive", strata=cost.strata) if better else plan
 
