@@ -9,6 +9,7 @@ import pytest
 from conftest import COLOURS, build, diffuse, still_life
 
 import mi_sparse_prt as prt
+from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.planner import candidates
 from mi_sparse_prt.planner.choice import Predicted
 from mi_sparse_prt.solvers.paths import PathSolver
@@ -132,7 +133,7 @@ def test_areas_of_texels_by_their_edges(scene):
 
 
 def test_areas_of_texels_by_ever_more_strata():
-    """Slats that are narrower than texels: edges are 12% off, four rays 8%; the target is met all the same."""
+    """Slats that are narrower than texels: edges are 4.3% off, four rays 3.3%; the target is met all the same."""
     slats = {
         f"slat_{k}": {
             "type": "rectangle",
@@ -142,13 +143,19 @@ def test_areas_of_texels_by_ever_more_strata():
         for k, x in enumerate(np.arange(-3, 3, 0.4))
     }
     scene = build(0.4, floor={"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5)}, **slats)
-    report = prt.precompute(
-        scene, LIGHTING, basis="texel", max_depth=2, target_error=0.03, progress=False
-    ).report
+
+    def found(method: str | Plan) -> dict:
+        return prt.precompute(
+            scene, LIGHTING, method, "texel", max_depth=2, target_error=0.03, progress=False
+        ).report
+
+    report = found("auto")
     predicted = {plan["direct"]: plan["predicted_error"] for plan in report["plans"]}
-    assert report["plan"]["direct"] == "adaptive"
-    assert predicted["adaptive"] < 0.03 < min(predicted["edges"], predicted["exact"])
+    assert report["plan"]["direct"] == "adaptive" and predicted["adaptive"] < 0.03
     error = report["estimated_error"]
+    others = [found(Plan(direct))["estimated_error"]["total"] for direct in ("edges", "exact")]
+    print("{:.1%}; edges {:.1%}, four rays {:.1%}".format(error["total"], *others))
+    assert min(others) > 0.03
     assert error["total"] < 0.03 + 2 * error["standard_error"]["total"]
 
 

@@ -287,7 +287,7 @@ def test_a_target_error_is_met_by_more_rays(method, basis):
         return
     tight = precompute(method=method, target_error=0.012).report
     assert tight["estimated_error"]["total"] < 0.016
-    assert tight["rays"]["gather"] >= (64 + 256) * n
+    assert tight["rays"]["gather"] >= (64 + 128) * n
     assert tight["estimated_error"]["total"] < loose["estimated_error"]["total"]
     assert max(tight["estimated_error"]["terms"]) <= max(loose["estimated_error"]["terms"])
 
