@@ -67,6 +67,28 @@ def test_rows_of_terms_are_those_of_rays(tilt, worst):
     assert square < worst**2 * norm
 
 
+@pytest.mark.parametrize("tilt", [0.0, 4.0, 33.0])
+def test_even_light_is_that_of_rays(tilt):
+    """
+    Scenario: a floor of rough metal alone, whose lobes hardly change within texels, under even light.
+    Expected: radiance towards all views within 2% of that by 16 x 16 rays in each texel.
+    """
+    metal = {"type": "roughconductor", "alpha": 0.4, "material": "Cr"}
+    turned = T().rotate([1, 0.3, 0], tilt).scale(2)
+    scene = build(1.0, floor={"type": "rectangle", "bsdf": metal, "to_world": turned})
+    found = matrix(scene, Plan("edges"))
+    reflection, m = found.reflection, LIGHTING.n_directions
+    rays = TermRays(DirectSolver(problem_at(scene, LIGHTING, basis="texel"), 16, 3), reflection)
+    points = np.arange(4)
+    true = rays.elements(np.repeat(points, m), np.tile(np.arange(m), 4)).reshape(4, m, -1).sum(axis=1)
+    rows = reflection.rows_of_each(points, 1 + TERMS)
+    ours = found.operators["direct"].rows(rows.ravel())[..., 0].sum(axis=1).reshape(rows.shape)
+    gram = reflection.gram(points)
+    square, norm = (np.einsum("kabc,ka,kb->", gram, x, x) for x in (ours - true, true))
+    print(f"{math.sqrt(square / norm):.2%}")
+    assert square < 0.02**2 * norm
+
+
 def test_a_pilot_knows_the_error_of_radiance():
     """
     Scenario: a glossy floor under a small board.
