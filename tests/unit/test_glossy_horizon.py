@@ -71,7 +71,8 @@ def test_rows_of_terms_are_those_of_rays(tilt, worst):
 def test_even_light_is_that_of_rays(tilt):
     """
     Scenario: a floor of rough metal alone, whose lobes hardly change within texels, under even light.
-    Expected: radiance towards all views within 2% of that by 16 x 16 rays in each texel.
+    Expected: radiance towards all views within 0.8% of that by 16 x 16 rays in each texel.
+    Result: 0.52, 0.45 and 0.34%; 1.69, 1.41 and 0.96% where texels that the horizon cuts count as a whole.
     """
     metal = {"type": "roughconductor", "alpha": 0.4, "material": "Cr"}
     turned = T().rotate([1, 0.3, 0], tilt).scale(2)
@@ -86,7 +87,7 @@ def test_even_light_is_that_of_rays(tilt):
     gram = reflection.gram(points)
     square, norm = (np.einsum("kabc,ka,kb->", gram, x, x) for x in (ours - true, true))
     print(f"{math.sqrt(square / norm):.2%}")
-    assert square < 0.02**2 * norm
+    assert square < 0.008**2 * norm
 
 
 def test_a_pilot_knows_the_error_of_radiance():
