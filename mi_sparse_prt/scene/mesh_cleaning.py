@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.triangle_mesh import (
     TriangleMesh,
-    connected_pieces,
+    as_one,
+    find_pieces,
     normalise_rows,
     triangle_normals,
     unique_rows,
@@ -161,26 +163,28 @@ def flip_sides(mesh: TriangleMesh) -> TriangleMesh:
     return replace(mesh, normals=normals, triangles=np.ascontiguousarray(mesh.triangles[:, [0, 2, 1]]))
 
 
-def faces_inwards(mesh: TriangleMesh) -> bool:
-    """Does a closed part of the mesh point into itself (negative signed volume)?
+def face_inwards(meshes: Sequence[TriangleMesh]) -> NDArray[np.bool_]:
+    """Which meshes have a closed part that points into itself (negative signed volume), (meshes,).
 
     Vertices are welded by position first. A part is closed if each of its edges belongs to two triangles.
     Which way a triangle faces is what its shading normals say, since that is what a one-sided BSDF looks at.
     """
-    first, same = unique_rows(mesh.positions)
-    t = same[mesh.triangles]
-    edges = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
-    edge = unique_rows(edges)[1]
-    pieces, label = connected_pieces(t, len(first))
-    part = label[t[:, 0]]  # [triangle]
-    is_open = np.zeros(pieces, bool)
-    is_open[np.repeat(part, 3)[np.bincount(edge)[edge] != 2]] = True
+    mesh, of = as_one(meshes)
+    result = np.zeros(len(meshes), np.bool_)
+    if not len(mesh.triangles):
+        return result
+    pieces = find_pieces(mesh, of)
+    edges = np.stack([pieces.corners, np.roll(pieces.corners, -1, axis=1)], axis=2)
+    edge = unique_rows(np.sort(edges, axis=2).reshape(-1, 2))[1]
+    is_open = np.zeros(len(pieces.first), np.bool_)
+    is_open[np.repeat(pieces.of, 3)[np.bincount(edge)[edge] != 2]] = True
 
-    p = mesh.positions.astype(np.float64)
-    corners = (p - p.mean(axis=0))[mesh.triangles]
+    corners = mesh.positions.astype(np.float64)[mesh.triangles]
+    corners -= corners[pieces.first, :1][pieces.of]  # what is small and far away has a volume, too
     volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-    if mesh.normals is not None:
-        shading = mesh.normals[mesh.triangles].sum(axis=1)
-        volume = np.where(np.sum(shading * triangle_normals(mesh), axis=1) < 0, -volume, volume)
-    volumes = np.bincount(part, volume, minlength=len(is_open))
-    return bool(np.any((volumes < 0) & ~is_open))
+    assert mesh.normals is not None
+    shading = mesh.normals[mesh.triangles].sum(axis=1)
+    volume = np.where(np.sum(shading * triangle_normals(mesh), axis=1) < 0, -volume, volume)
+    inwards = (np.bincount(pieces.of, volume, minlength=len(pieces.first)) < 0) & ~is_open
+    result[of[mesh.triangles[pieces.first[inwards], 0]]] = True
+    return result

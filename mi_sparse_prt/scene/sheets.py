@@ -21,7 +21,7 @@ from mi_sparse_prt.core.random_keys import hash_rows, random_generator
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.traced_scene import TracedScene
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, find_pieces
 
 FEW_RAYS, MANY_RAYS = (
     64,
@@ -117,11 +117,9 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
         if not material.two_sided:
             result.append(np.full(n, PASSES_LIGHT if material.passes_light else NO_PIECE, np.int64))
             continue
-        first, same = unique_rows(mesh.positions)
-        corners = same[mesh.triangles]
-        own, label = connected_pieces(corners, len(first))
-        result.append(count + label[corners[:, 0]].astype(np.int64))
-        count += own
+        own = find_pieces(mesh)
+        result.append(count + own.of)
+        count += len(own.first)
     return np.concatenate(result)
 
 

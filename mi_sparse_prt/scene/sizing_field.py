@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from mi_sparse_prt.scene.mesh_cleaning import drop_unreferenced
 from mi_sparse_prt.scene.subdivision import TIE, Doubles, Project, TooManyVerticesError, subdivide
-from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, connected_pieces, unique_rows
+from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, as_one, find_pieces, unique_rows
 
 ACROSS = 8  # edges along the diagonal of a piece, within a factor of sqrt(2): they are halved
 GRADE = 0.5  # by which edges grow with their distance from a piece
@@ -98,17 +98,21 @@ def refine_near_details(
     limit : int
         The largest number of vertices allowed.
     """
-    halvings = [_halvings(mesh, edge_length) for mesh in meshes]
+    whole, of = as_one(meshes)
+    halvings = _halvings(whole, of, edge_length)
+    moves = np.array([project is not None for project in projections], np.bool_)
     found, details = list(meshes), None
-    count = sum(len(mesh.positions) for mesh in meshes)
+    count = len(whole.positions)
     more = min(limit - count, max(LEAST, int(SHARE * count)))
-    deepest = min(MOST, max((int(h.max(initial=0)) for h in halvings), default=0))
+    deepest = min(MOST, int(halvings.max(initial=0)))
     if not deepest:
         return found, details
     for most in (deepest, *range(1, deepest)):  # mostly, all can be had; if not, as much as can be
         try:
-            field = SizingField(edge_length, _small_pieces(meshes, halvings, edge_length, most, more))
-            found, details = _subdivided(meshes, projections, field, more), field.details
+            wanted = np.minimum(halvings, most)
+            field = SizingField(edge_length, _small_pieces(whole, moves[of], wanted, edge_length, more))
+            long = np.unique(of[_ends_of_long_edges(whole, field)])
+            found, details = _subdivided(meshes, projections, long, field, more), field.details
         except TooManyVerticesError:
             if most < deepest:
                 break
@@ -118,59 +122,71 @@ def refine_near_details(
     return found, details
 
 
-def _halvings(mesh: TriangleMesh, edge_length: float) -> NDArray[np.int64]:
+def _halvings(mesh: TriangleMesh, mesh_of: NDArray[np.int64], edge_length: float) -> NDArray[np.int64]:
     """(t,) how often an edge is halved that is to fit the connected piece that a triangle belongs to."""
     if not len(mesh.triangles):
         return np.zeros(0, np.int64)
-    first, same = unique_rows(mesh.positions)
-    of = connected_pieces(same[mesh.triangles], len(first))[1][same].astype(np.int64)
-    order = np.argsort(of, kind="stable")
-    starts = np.flatnonzero(np.diff(of[order], prepend=-1))
-    points = mesh.positions[order].astype(np.float64)
-    box = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+    pieces = find_pieces(mesh, mesh_of)
+    order = np.argsort(pieces.of, kind="stable")
+    starts = np.flatnonzero(np.diff(pieces.of[order], prepend=-1))
+    points = mesh.positions.astype(np.float64)[mesh.triangles[order]]  # [triangle, corner, xyz]
+    high = np.maximum.reduceat(points.max(axis=1), starts)
+    box = high - np.minimum.reduceat(points.min(axis=1), starts)
     fitting = np.linalg.norm(box, axis=1) / ACROSS
     halved = np.log2(edge_length / np.maximum(fitting * (1 + TIE), edge_length / 2**MOST))
-    return np.maximum(np.rint(halved), 0).astype(np.int64)[of[mesh.triangles[:, 0]]]
+    return np.maximum(np.rint(halved), 0).astype(np.int64)[pieces.of]
 
 
 def _small_pieces(
-    meshes: Sequence[TriangleMesh],
-    halvings: Sequence[NDArray[np.int64]],
+    mesh: TriangleMesh,
+    moves: NDArray[np.bool_],
+    halvings: NDArray[np.int64],
     edge_length: float,
-    most: int,
     more: int,
 ) -> list[tuple[float, KDTree]]:
-    """Of all meshes, by how often an edge is halved that is to fit them, ``most`` times at most.
+    """Pieces by how often an edge is halved that is to fit them.
 
-    They have so many vertices ``more`` at most, or TooManyVerticesError.
+    Those whose vertices (``moves``) may become more have so many more at most, or TooManyVerticesError; what stays as
+    it is has the vertices that it has.
     """
-    found = []
-    for k in range(1, most + 1):
+    found, of_moving = [], moves[mesh.triangles[:, 0]]
+    for k in range(1, int(halvings.max()) + 1):
         length, points = edge_length / 2**k, []
-        for mesh, own in zip(meshes, halvings, strict=True):
-            belongs = own == k if k < most else own >= k
-            if belongs.any():
-                piece, _ = drop_unreferenced(mesh.take_triangles(belongs))
+        for part in (of_moving, ~of_moving):
+            piece, _ = drop_unreferenced(mesh.take_triangles((halvings == k) & part))
+            if part is of_moving and len(piece.triangles):
                 piece = subdivide(piece, length, len(piece.positions) + more)
-                points.append(piece.positions.astype(np.float64))
-        if points:
-            every = np.concatenate(points)
+            points.append(piece.positions.astype(np.float64))
+        every = np.concatenate(points)
+        if len(every):
             first, _ = unique_rows(np.floor(every / (length / 2)))
             found.append((length, KDTree(every[first])))
     return found
 
 
+def _ends_of_long_edges(mesh: TriangleMesh, field: SizingField) -> NDArray[np.int32]:
+    """Vertices at which an edge starts that is to be split."""
+    start, end = mesh.triangles.ravel(), np.roll(mesh.triangles, -1, axis=1).ravel()
+    a, b = (mesh.positions[ends].astype(np.float64) for ends in (start, end))
+    length = np.linalg.norm(b - a, axis=1)
+    some = np.flatnonzero(length > field.shortest * (1 + TIE))
+    ends: NDArray[np.int32] = start[some[length[some] > field((a[some] + b[some]) / 2)]]
+    return ends
+
+
 def _subdivided(
     meshes: Sequence[TriangleMesh],
     projections: Sequence[Project | None],
+    which: NDArray[np.integer],
     field: SizingField,
     more: int,
 ) -> list[TriangleMesh]:
-    """Meshes with edges as a field has them; at most so many vertices ``more``, or TooManyVerticesError."""
-    found = []
-    for mesh, project in zip(meshes, projections, strict=True):
-        count = len(mesh.positions)
-        fine = mesh if project is None else subdivide(mesh, field, count + more, project)
-        more -= len(fine.positions) - count
-        found.append(fine)
+    """Meshes of which some have edges to be split; at most so many vertices ``more``, or TooManyVerticesError."""
+    found = list(meshes)
+    for k in which:
+        project = projections[k]
+        if project is not None:
+            count = len(meshes[k].positions)
+            found[k] = subdivide(meshes[k], field, count + more, project)
+            more -= len(found[k].positions) - count
     return found

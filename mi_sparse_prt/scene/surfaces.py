@@ -21,7 +21,7 @@ from mi_sparse_prt.scene.mesh_cleaning import (
     check_geometry,
     drop_degenerate,
     drop_unreferenced,
-    faces_inwards,
+    face_inwards,
     flip_sides,
     make_unit_normals,
     split_by_face,
@@ -103,15 +103,16 @@ def read_surfaces(
     if edge_length is None:
         edge_length = _diagonal(placed, clean) / 64
     surfaces: list[tuple[TriangleMesh, Material]] = []
-    limit, fewest = most_vertices, _segments_around(placed)
+    whole, limit, fewest = [], most_vertices, _segments_around(placed)
     for where, mesh, material in zip(placed, clean, materials, strict=True):
         if mesh is None:
             mesh = where.in_world(_tessellate(where, material, edge_length, limit, fewest), limit)
-        _note_if_inwards(mesh, material, notes)
+        whole.append(mesh)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
         limit -= len(mesh.positions)
         surfaces.append((mesh, material))
+    _note_inwards(whole, materials, notes)
     if automatic:
         meshes = [mesh for mesh, _ in surfaces]
         meshes, details = refine_near_details(
@@ -145,12 +146,15 @@ def _note_media(scene: mi.Scene, notes: Notes) -> None:
             notes.add(thing.id(), fact)
 
 
-def _note_if_inwards(mesh: TriangleMesh, material: Material, notes: Notes) -> None:
-    """Note a closed shape that is black from outside."""
-    if material.two_sided or material.passes_light or not len(mesh.triangles):
-        return
-    if faces_inwards(mesh):
-        notes.add(mesh.name, _FACES_INWARDS)
+def _note_inwards(meshes: list[TriangleMesh], materials: list[Material], notes: Notes) -> None:
+    """Note closed shapes that are black from outside."""
+    seen = [
+        mesh
+        for mesh, material in zip(meshes, materials, strict=True)
+        if len(mesh.triangles) and not material.two_sided and not material.passes_light
+    ]
+    for k in np.flatnonzero(face_inwards(seen)):
+        notes.add(seen[k].name, _FACES_INWARDS)
 
 
 def _diagonal(placed: list[PlacedShape], clean: list[TriangleMesh | None]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -130,6 +131,43 @@ def connected_pieces(triangles: NDArray[np.integer], n: int) -> tuple[int, NDArr
     edges = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
     graph = scipy.sparse.coo_array((np.ones(2 * len(triangles), np.int8), edges), shape=(n, n))
     return connected_components(graph, directed=False)
+
+
+def as_one(meshes: Sequence[TriangleMesh]) -> tuple[TriangleMesh, NDArray[np.int64]]:
+    """Positions, normals and triangles of meshes with normals as those of one; which one each vertex is of, (n,)."""
+    if not meshes:
+        nothing = np.zeros((0, 3), np.float32)
+        return TriangleMesh("", nothing, nothing, np.zeros((0, 3), np.int32)), np.zeros(0, np.int64)
+    bare = [TriangleMesh(mesh.name, mesh.positions, mesh.normals, mesh.triangles) for mesh in meshes]
+    return concatenated(bare), np.repeat(np.arange(len(meshes)), [len(mesh.positions) for mesh in meshes])
+
+
+class Pieces(NamedTuple):
+    """Connected pieces of triangles, those of the first mesh first.
+
+    Attributes
+    ----------
+    of : (t,) int64
+        The piece that each triangle belongs to.
+    first : (pieces,) int64
+        A triangle of each.
+    corners : (t, 3) int64
+        Vertices of the triangles, welded by position: seams do not part a surface.
+    """
+
+    of: NDArray[np.int64]
+    first: NDArray[np.int64]
+    corners: NDArray[np.int64]
+
+
+def find_pieces(mesh: TriangleMesh, mesh_of: NDArray[np.integer] | None = None) -> Pieces:
+    """Connected pieces of a mesh, or of meshes that are one, where no piece is of two (``as_one``)."""
+    rows = mesh.positions.astype(np.float64)
+    first, same = unique_rows(rows if mesh_of is None else np.column_stack([mesh_of, rows]))
+    corners = same[mesh.triangles]
+    _, label = connected_pieces(corners, len(first))
+    _, found, of = np.unique(label[corners[:, 0]], return_index=True, return_inverse=True)
+    return Pieces(of, found, corners)
 
 
 def triangle_keys(mesh: TriangleMesh, vertex_keys: NDArray[np.uint64], seed: np.uint64) -> NDArray[np.uint64]:

@@ -178,8 +178,9 @@ class DirectSolver:
 
     def _summed(self, points: mi.UInt32, texels: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """Cosines times solid angles of what is seen of texels, and of all above the horizon."""
-        across = self.strata
-        lane = dr.arange(mi.UInt32, len(texels) * across)
+        # one kernel for all numbers of strata
+        across = dr.opaque(mi.UInt32, self.strata)
+        lane = dr.arange(mi.UInt32, len(texels) * self.strata)
         element = lane // across
         row = lane - element * across
         point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
@@ -188,7 +189,7 @@ class DirectSolver:
         def trace(
             column: mi.UInt32, rng: mi.PCG32, seen: mi.Float, total: mi.Float
         ) -> tuple[mi.UInt32, mi.PCG32, mi.Float, mi.Float]:
-            u, v = ((mi.Float(k) + rng.next_float32()) / across for k in (column, row))
+            u, v = ((mi.Float(k) + rng.next_float32()) / mi.Float(across) for k in (column, row))
             direction, area = self._texels.inside(texel, u, v)
             visible, cosine = self.trace(point, direction, mi.Mask(True))
             every = dr.maximum(cosine, 0) * area
@@ -202,7 +203,7 @@ class DirectSolver:
             state, lambda column, *_: column < across, trace, mode="evaluated" if passes else "symbolic"
         )
         dr.eval(seen, total)
-        seen, total = (dr.block_reduce(dr.ReduceOp.Add, x, across) for x in (seen, total))
+        seen, total = (dr.block_reduce(dr.ReduceOp.Add, x, self.strata) for x in (seen, total))
         return seen, total
 
     def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from mi_sparse_prt.scene.mesh_cleaning import (
     check_geometry,
     drop_degenerate,
     drop_unreferenced,
-    faces_inwards,
+    face_inwards,
     flip_sides,
     make_unit_normals,
     split_by_face,
@@ -321,8 +321,11 @@ def test_normals_are_made_unit_and_good_ones_keep_their_bits() -> None:
 @pytest.mark.parametrize("flip", [False, True])
 def test_closed_parts_that_face_inwards_are_found(flip: bool) -> None:
     mesh = tetrahedron(flip)
-    assert faces_inwards(mesh) is flip
-    assert faces_inwards(split_by_face(mesh)) is flip  # welded by position
+    assert list(face_inwards([mesh, tetrahedron(), split_by_face(mesh)])) == [
+        flip,
+        False,
+        flip,
+    ]  # welded by position
     far = tetrahedron()
     both = TriangleMesh(
         "both",
@@ -330,5 +333,6 @@ def test_closed_parts_that_face_inwards_are_found(flip: bool) -> None:
         np.concatenate([far.normals, mesh.normals]),
         np.concatenate([far.triangles, mesh.triangles + 4]),
     )
-    assert faces_inwards(both) is flip
-    assert not faces_inwards(mesh.take_triangles(np.arange(3)))  # an open part may face anywhere
+    opened = mesh.take_triangles(np.arange(3))  # may face anywhere
+    assert list(face_inwards([both, opened])) == [flip, False]
+    assert not len(face_inwards([]))
