@@ -38,7 +38,7 @@ def compiled_by(work: Callable[[], object]) -> set[str]:
         dr.kernel_history_clear()
         work()
         history = dr.kernel_history([dr.KernelType.JIT])
-    codes = [_code(kernel) for kernel in history]
+    codes = [_code(kernel) for kernel in {kernel["hash"]: kernel for kernel in history}.values()]
     return {code for code in codes if any(word in code for word in ("_in_ctx", "_optix_"))}
 
 

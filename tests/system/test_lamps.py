@@ -296,7 +296,10 @@ def assert_means_are_those_of_path(
 
 
 @pytest.mark.usefixtures("no_held_out")
-@pytest.mark.parametrize("kind", BALLS)
+@pytest.mark.parametrize(
+    "kind",
+    ["rough glass", "mask", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mirror", "glass"))],
+)
 def test_a_picture_with_mirrors_glass_and_masks(kind):
     """Rationale: rays that a camera follows look lamps up; surfaces are lit by way of the ball, and through it.
 
@@ -309,6 +312,7 @@ def test_a_picture_with_mirrors_glass_and_masks(kind):
     assert_means_are_those_of_path(scene, transport, parts, spp=256, seeds=8)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_held_out")
 def test_a_picture_of_what_rough_glass_focuses():
     """Rationale: no ray meets a sun; where light of it leaves rough glass, a shadow ray finds it, as in `path`.

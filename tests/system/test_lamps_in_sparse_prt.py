@@ -262,7 +262,7 @@ def test_surfaces_that_a_cameras_ray_met_count(folder, artefact):
     assert distance < 0.02
 
 
-@pytest.mark.parametrize("lamp", [PLAIN, FAR], ids=["panel", "sun"])
+@pytest.mark.parametrize("lamp", [pytest.param(PLAIN, marks=pytest.mark.slow), FAR], ids=["panel", "sun"])
 def test_what_rough_glass_focuses(folder, artefact, lamp):
     """Rationale: rays that rough glass scatters meet area lamps, and points and suns are asked where it does.
 

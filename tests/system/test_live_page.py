@@ -118,7 +118,7 @@ def far(ours: np.ndarray, theirs: np.ndarray) -> float:
     return float(flip_map(np.clip(theirs, 0, 1), ours).mean())
 
 
-@pytest.mark.parametrize("served", ["glossy", "lamps"], indirect=True)
+@pytest.mark.parametrize("served", ["glossy", pytest.param("lamps", marks=pytest.mark.slow)], indirect=True)
 def test_streamed_pictures_are_those_of_render(driver, scene, served, artefact):
     """Rationale: glossy surfaces are shaded for each view, lamps for each brightness, and Python sends the colours.
 
@@ -181,7 +181,7 @@ def served_image(served, view: dict, spp: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("served", ["clusters"], indirect=True)
-@pytest.mark.parametrize("by", ["render", "path"])
+@pytest.mark.parametrize("by", [pytest.param("render", marks=pytest.mark.slow), "path"])
 def test_a_picture_by_python_lies_over_the_page(driver, served, by):
     """Right of the line is Python's picture, of the same view and light; it goes when the light moves."""
     settled(driver)
@@ -320,6 +320,7 @@ def test_two_browsers_and_one_that_comes_back(driver, scene, transports):
     driver.get_log("browser")  # it told of the server that was gone
 
 
+@pytest.mark.slow
 def test_memory_stays_as_it_is(driver, scene, transports):
     """5,000 frames of a light that turns. Expected: less than 1 MB more is in use after the second half.
 

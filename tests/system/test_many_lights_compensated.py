@@ -156,7 +156,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param("mirror and glass", marks=pytest.mark.slow), *list(CASES)[1:]])
 def test_regions_are_those_of_path(name: str) -> None:
     """Quarters of the image, where mirrors, glass, glossy surfaces, holes and panes are beside diffuse ones.
 

@@ -85,6 +85,7 @@ def test_frames_flicker_less_than_pictures(scene, cameras, references) -> None:
     assert np.linalg.norm(errors) < 1.5 * np.linalg.norm(others)
 
 
+@pytest.mark.slow
 def test_frames_are_right_on_average(scene, cameras) -> None:
     """20 seeds of two frames, few rows. Expected: on average all lights of the same seed, within 4 standard errors."""
     pair = cameras[::7]

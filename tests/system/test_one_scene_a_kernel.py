@@ -40,12 +40,13 @@ CAMERA = {
 
 
 def scenes_traced(work: Callable[[], object]) -> list[int]:
-    """In how many scenes each of the kernels that trace rays does so."""
+    """In how many scenes each kernel that traces rays does so."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         work()
         history = dr.kernel_history([dr.KernelType.JIT])
-    code = [k["ir"] if isinstance(k["ir"], str) else k["ir"].read() for k in history]
+    kernels = {kernel["hash"]: kernel["ir"] for kernel in history}.values()
+    code = [ir if isinstance(ir, str) else ir.read() for ir in kernels]
     counts = [len({scene for _, scene in TRACED.findall(text)}) for text in code]
     return [count for count in counts if count]
 

@@ -35,7 +35,9 @@ def small_things(ground: dict) -> mi.Scene:
     )
 
 
-@pytest.mark.parametrize("ground", [PLAIN, PLANET], ids=["plain", "planet"])
+@pytest.mark.parametrize(
+    "ground", [PLAIN, pytest.param(PLANET, marks=pytest.mark.slow)], ids=["plain", "planet"]
+)
 def test_shadows_of_small_things(ground, tmp_path):
     """
     Scenario: a ground that is a thousand times as large as what stands on it.

@@ -118,7 +118,11 @@ def test_gathered_light_is_that_of_paths():
 
 
 @pytest.mark.parametrize(
-    ("glass", "spp"), [({"type": "dielectric"}, 6144), ({"type": "roughdielectric", "alpha": 0.2}, 57344)]
+    ("glass", "spp"),
+    [
+        ({"type": "dielectric"}, 6144),
+        pytest.param({"type": "roughdielectric", "alpha": 0.2}, 57344, marks=pytest.mark.slow),
+    ],
 )
 def test_specular_light_is_what_paths_find_beside_the_rest(glass, spp):
     """Expected: the part by way of mirrors and glass alone is what all paths find less those scattered on the way.

@@ -38,6 +38,7 @@ def sums(found: TermRows) -> np.ndarray:
     return np.stack([np.asarray(m.sum(axis=1)).ravel() for m in found.matrices], axis=1)
 
 
+@pytest.mark.slow
 def test_fewer_rays_into_coats_find_the_same(monkeypatch):
     """
     Expected: with rays by the share of light that surfaces send on, less than half of the rays; the light of all

@@ -55,6 +55,7 @@ def test_unknown_lamps_are_told_in_a_line() -> None:
         prt.ManyLightsImage(np.zeros((2, 2, 3)), np.ones((2, 2)), {}, {}).mixed({"lamp": 1})
 
 
+@pytest.mark.slow
 def test_a_mixture_is_the_picture_of_a_scene_with_other_lamps() -> None:
     """A room whose lamp, which the camera sees, and point are dimmed and coloured; in the picture, and in the scene.
 
