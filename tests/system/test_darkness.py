@@ -47,7 +47,7 @@ def test_an_unoccluded_row():
 
 
 @pytest.mark.filterwarnings("ignore:.*faces point inwards")
-@pytest.mark.parametrize("method", ["auto", "sparse", "brute_force"])
+@pytest.mark.parametrize("method", ["auto", "sparse", pytest.param("brute_force", marks=pytest.mark.slow)])
 def test_a_closed_room_is_not_refined(method):
     """Rationale: a target error is relative, and nothing is met of nothing.
     Expected: one attempt, dark rows, no warning of a missed target, and the report says why.

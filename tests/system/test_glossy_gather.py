@@ -281,7 +281,9 @@ def test_noise_of_rays_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.5 * known < np.mean(pairs) / np.linalg.norm(exact) < 1.33 * known
 
 
-@pytest.mark.parametrize("rays, tolerance", [(64, 0.06), (256, 0.03), (1024, 0.06)])
+@pytest.mark.parametrize(
+    "rays, tolerance", [(64, 0.06), (256, 0.03), pytest.param(1024, 0.06, marks=pytest.mark.slow)]
+)
 def test_what_more_rays_can_take_away_is_known(rays: int, tolerance: float) -> None:
     """
     Rationale: of a glossy ball beside a glossy ground, noise of rays and low ranks count as far as they make radiance.

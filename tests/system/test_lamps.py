@@ -396,7 +396,12 @@ def test_points_of_a_measurement_are_in_the_world(scene, transport):
 
 @pytest.mark.usefixtures("no_held_out")
 @pytest.mark.parametrize(
-    "lamp", [PANEL, {"type": "point", "position": [-0.3, 2.2, 1.2], "intensity": 6.0}], ids=["panel", "point"]
+    "lamp",
+    [
+        pytest.param(PANEL, marks=pytest.mark.slow),
+        {"type": "point", "position": [-0.3, 2.2, 1.2], "intensity": 6.0},
+    ],
+    ids=["panel", "point"],
 )
 def test_glossy_surfaces_show_lamps(lamp):
     """Rationale: no row tells what a golden ball reflects to the camera: its rays go on, to lamps that they can meet by

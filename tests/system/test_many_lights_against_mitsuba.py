@@ -108,7 +108,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+# what these have, others have, too
+LONG = ("rough gold, direct", "interreflection of a spot")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in CASES]
+)
 def test_all_lights_agree_with_mitsuba(name: str) -> None:
     """The sum of all elements is what ``direct`` or ``path`` of the same depth render.
 

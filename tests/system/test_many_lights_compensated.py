@@ -156,7 +156,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param("mirror and glass", marks=pytest.mark.slow), *list(CASES)[1:]])
+QUICK = "gold, a mask and plastic"
+
+
+@pytest.mark.parametrize(
+    "name", [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != QUICK)]
+)
 def test_regions_are_those_of_path(name: str) -> None:
     """Quarters of the image, where mirrors, glass, glossy surfaces, holes and panes are beside diffuse ones.
 
@@ -176,7 +181,7 @@ def test_regions_are_those_of_path(name: str) -> None:
     assert np.all((np.abs(z_scores(*quarters)) < 4) | (np.abs(off) < 0.002))
 
 
-@pytest.mark.parametrize("depth", [3, 4, -1])
+@pytest.mark.parametrize("depth", [3, pytest.param(4, marks=pytest.mark.slow), -1])
 def test_depths_are_those_of_path(depth: int) -> None:
     """A corner before a mirror, at some depths.
 

@@ -96,8 +96,9 @@ def error(ours: list[np.ndarray], theirs: list[np.ndarray]) -> float:
 
 
 @pytest.mark.parametrize("hide", [False, True])
-# each light alone is in the other two
-@pytest.mark.parametrize("light", ["sky", "panel", pytest.param("both", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "light", ["panel", *(pytest.param(light, marks=pytest.mark.slow) for light in ("sky", "both"))]
+)
 def test_alpha_and_hidden_emitters(integrator: dict, light: str, hide: bool) -> None:
     """
     Rationale: an image is put in front of another by its alpha; hidden lamps do not stand in the way.

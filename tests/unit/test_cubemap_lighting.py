@@ -236,7 +236,7 @@ SUNS = [(0.3, 0.5, 0.8), (-0.866, -0.43, 0.254), (-0.901, 0.276, 0.335), (-0.871
 
 
 @pytest.mark.parametrize("direction", SUNS)
-@pytest.mark.parametrize("kind", ["sunsky", "sun"])
+@pytest.mark.parametrize("kind", ["sunsky", pytest.param("sun", marks=pytest.mark.slow)])
 def test_a_sun_smaller_than_samples_keeps_its_energy(kind, direction):
     """Its sun is half a degree wide and most of its light. Truth: Mitsuba's own samples of it."""
     only_sun = {"sky_scale": 0.0} if kind == "sun" else {}

@@ -267,7 +267,7 @@ def test_a_target_far_off_takes_a_quarter(exact):
         pytest.param("brute_force", "direction", marks=pytest.mark.slow),
         ("brute_force", "texel"),
         ("sparse", "direction"),
-        ("huang2010", "direction"),
+        pytest.param("huang2010", "direction", marks=pytest.mark.slow),
     ],
 )
 def test_intervals_from_few_elements(grey_scene, method, basis):

@@ -177,7 +177,7 @@ def test_errors_at_a_contact_shrink(monkeypatch):
     assert errors[0] < errors[1] / 1.33
 
 
-@pytest.mark.parametrize("depth", [0.0, 0.005], ids=["sheet", "board"])
+@pytest.mark.parametrize("depth", [0.0, pytest.param(0.005, marks=pytest.mark.slow)], ids=["sheet", "board"])
 def test_what_stands_just_before_a_wall(depth):
     """Rationale: vertices of a wall in the gap behind a board are dark, and the wall beside the board is not.
 

@@ -242,7 +242,9 @@ def test_sets_of_representatives_are_apart() -> None:
     assert found[0].weights == pytest.approx(np.tile([[[8.0], [1.0]]], (4, 1, 3)))
 
 
-@pytest.mark.parametrize(("sets", "pixels"), [(1, 1024), (4, 1024), (4, 64)])
+@pytest.mark.parametrize(
+    ("sets", "pixels"), [(1, 1024), pytest.param(4, 1024, marks=pytest.mark.slow), (4, 64)]
+)
 def test_the_predicted_error_is_that_of_the_image(
     matrix: Elements, whole: np.ndarray, sets: int, pixels: int, monkeypatch
 ) -> None:

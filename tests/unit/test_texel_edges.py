@@ -251,7 +251,7 @@ def gravel(share: float, seed: int, fine: float = 90.0):
     return open_at
 
 
-@pytest.mark.parametrize("share", [0.1, 0.9], ids=["specks", "holes"])
+@pytest.mark.parametrize("share", [0.1, pytest.param(0.9, marks=pytest.mark.slow)], ids=["specks", "holes"])
 def test_what_is_finer_than_texels_does_not_get_lost(share):
     """Rationale: a speck has a centre in it as often as its area says; if it then counts by its area, most is lost.
 
