@@ -77,10 +77,10 @@ def test_precomputing_rendering_and_validating(kind):
     """
     if kind != "lamps":
         shapes = {"pane": PANE, "glass": GLASS, "mirror": MIRROR} if kind == "panes" else {}
-        scene = prt.Scene.from_mitsuba(lit_scene("sky", **shapes), 0.3)
+        scene = prt.Scene.from_mitsuba(lit_scene("sky", **shapes), 0.6)
         emission, options = prt.CubemapLighting(2), {"basis": "texel"}
     else:
-        scene = prt.Scene.from_mitsuba(lit_scene("panel", "bulb", glass=GLASS, mirror=MIRROR), 0.3)
+        scene = prt.Scene.from_mitsuba(lit_scene("panel", "bulb", glass=GLASS, mirror=MIRROR), 0.6)
         emission, options = prt.SceneEmitters(scene), {}
 
     def work() -> None:
