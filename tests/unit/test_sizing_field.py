@@ -7,6 +7,7 @@ from conftest import T, diffuse
 
 from mi_sparse_prt.scene import sizing_field
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.scene.subdivision import subdivide
 
 GREY = diffuse(0.5, 0.5, 0.5)
 
@@ -97,6 +98,25 @@ def test_vertices_are_limited(monkeypatch):
         monkeypatch.setattr(sizing_field, "LEAST", more)
         assert few <= scene(100, *boxes).n_vertices <= few + more
     assert scene(100, *boxes).n_vertices > few + 3000
+
+
+def test_what_is_fine_enough_is_not_looked_at_one_by_one(monkeypatch):
+    """
+    Rationale: a thousand shapes loaded three times as long as they do since pieces of all meshes are found together.
+    Expected: of 100 balls, which are fine enough, only the plain below them is split, and pieces of one size together,
+        in some tries: vertices may not suffice for all of these.
+    """
+    calls = []
+    monkeypatch.setattr(
+        sizing_field, "subdivide", lambda mesh, *more: calls.append(mesh.name) or subdivide(mesh, *more)
+    )
+    places = np.random.default_rng(0).uniform(-9, 9, (100, 2)).tolist()
+    balls = [
+        {"type": "sphere", "center": [x, 0.3, z], "radius": (0.3, 0.6)[k % 2]}
+        for k, (x, z) in enumerate(places)
+    ]
+    scene(10, *balls)
+    assert 1 < len(calls) < 12
 
 
 def test_instances_are_as_fine_as_other_things():
