@@ -36,7 +36,7 @@ class TermPilot(PilotElements):
         self._own, count = reflection.take(self.vertices), self.texels.shape[1]
         self._which = self._own.glossy
         self._gram = self._own.gram(self._which).astype(np.float64)
-        self._tables = incident_tables(reflection.factors)
+        self._tables = incident_tables(reflection.factors, texels=problem.emission.n_directions)
         rays = TermRays(DirectSolver(problem, STRATA), reflection)
         asked = np.repeat(self.vertices[self._which], count), self.texels[self._which].ravel()
         shape = len(self._which), count, 1 + reflection.terms

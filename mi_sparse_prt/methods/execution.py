@@ -113,7 +113,8 @@ class Execution:
         if not isinstance(reflection, InOutFactors):
             return light
         assert isinstance(light.direct, Visibility | FractionalVisibility)
-        tables = incident_tables(reflection.factors)
+        texels = self._problem.emission.n_directions if self._problem.basis == "texel" else None
+        tables = incident_tables(reflection.factors, texels=texels)
         factored = FactoredVisibility(light.direct, reflection.tangents, reflection.material, tables)
         return replace(light, direct=factored)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.reflection.brdf_factors import BrdfFactors
 
 SIZE = 128  # of a table, unless something else is asked for
+POINTS = 32  # of a disc
 
 Floats = NDArray[np.float32]
 
@@ -32,10 +33,40 @@ def table_directions(size: int = SIZE) -> Floats:
     return (np.stack([2 * x, 2 * y, 1 - square], axis=1) / (1 + square)[:, None]).astype(np.float32)
 
 
-def incident_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Floats:
-    """f_k of some materials, (materials, size, size, K); zeros where one has fewer terms."""
+def incident_tables(materials: Sequence[BrdfFactors], size: int = SIZE, texels: int | None = None) -> Floats:
+    """f_k of some materials, (materials, size, size, K); zeros where one has fewer terms.
+
+    Parameters
+    ----------
+    materials : sequence of BrdfFactors
+    size : int
+    texels : int, optional
+        Each entry is a mean over a disc as large as one of so many texels of a sphere, or what of it is above the
+        horizon. Of plastic of roughness 0.1, f_k at the centres of 1536 texels (n = 16) is 5 to 6% off means over
+        these, means over discs are 3% off.
+    """
     every = table_directions(size)
-    return _stack([m.grid.interpolate(m.incident, every).T.reshape(size, size, -1) for m in materials])
+    disc = every[:, None] if texels is None else _disc(every, 4 * np.pi / texels)
+    above = disc[..., 2] > 0
+    weight = (above / np.maximum(above.sum(axis=1, keepdims=True), 1)).astype(np.float32)
+    found = []
+    for m in materials:
+        values = m.grid.interpolate(m.incident, disc.reshape(-1, 3)).reshape(-1, *weight.shape)
+        found.append(np.einsum("kmd,md->mk", values, weight, optimize=True).reshape(size, size, -1))
+    return _stack(found)
+
+
+def _disc(centres: Floats, solid_angle: float) -> Floats:
+    """Directions (m, POINTS, 3), evenly around those in the middle (m, 3), on a spiral."""
+    place = (np.arange(POINTS) + 0.5) / POINTS
+    height = 1 - place * solid_angle / (2 * np.pi)
+    turn = np.pi * (3 - 5**0.5) * np.arange(POINTS)
+    local = np.stack([np.cos(turn), np.sin(turn)]) * np.sqrt(1 - height**2)
+    aside = np.where(np.abs(centres[:, 2:]) < 0.9, [[0, 0, 1]], [[1, 0, 0]])
+    u = np.cross(aside, centres)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    axes = np.stack([u, np.cross(centres, u), centres], axis=1)  # [direction, axis, xyz]
+    return np.einsum("aj,max->mjx", [*local, height], axes).astype(np.float32)
 
 
 def outgoing_tables(materials: Sequence[BrdfFactors], size: int = SIZE) -> Floats:
