@@ -1,8 +1,9 @@
 """Direct light of glossy points, one row for each term of their BRDF; visibility is that of the point.
 
 ``T_k(x, j) = f_k(w_j in the frame of x) V(x, w_j) d_omega_j`` ([HR10] eq. 3), f_k of either sign. In the texel basis V
-is the visible share of the texel, and f_k that of its centre. Of a texel that the horizon cuts, only the part above it
-counts, and the height of that: many lobes are brightest near the horizon, where irradiance is next to nothing.
+is the visible share of the texel, and tables have means of f_k over discs as large as texels. Of a texel that the
+horizon cuts, only the part above it counts, and the height of that: many lobes are brightest near the horizon, where
+irradiance is next to nothing.
 """
 
 from __future__ import annotations
