@@ -72,6 +72,7 @@ def test_diffuse_scenes_do_not_change(grey_scene):
     assert_same(*matrices)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
 @pytest.mark.usefixtures("no_held_out")
 def test_rough_conductor():

@@ -268,6 +268,7 @@ def room() -> prt.Scene:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_without_a_depth_limit(artefact):
     """Rationale: max_depth -1 ends paths by Russian roulette alone, in a room of albedo 0.9 that is nearly closed.
 

@@ -175,7 +175,7 @@ def test_a_room_with_all_kinds_of_light(folder, artefact):
     assert distance < 0.03
 
 
-@pytest.mark.parametrize("sky", [SKY, pytest.param("", marks=pytest.mark.slow)], ids=["sky", "none"])
+@pytest.mark.parametrize("sky", [pytest.param(SKY, marks=pytest.mark.slow), ""], ids=["sky", "none"])
 def test_instances_under_lamps(folder, artefact, sky):
     """Rationale: scenes made of a scene's shapes, for its lamps alone, cannot have instances without their groups.
 

@@ -421,6 +421,7 @@ def exchanged(driver, notebook, until: str) -> None:
     raise AssertionError(f"never: {until}")
 
 
+@pytest.mark.slow
 def test_a_notebook_has_light_and_camera_as_traits(driver, scene, transports, notebook):
     viewer, quiet = notebook.viewer, "v.exact && !v.streamed.busy && !v.streamed.again && !v.streamed.old"
     exchanged(driver, notebook, quiet)

@@ -180,6 +180,7 @@ def test_a_mirror_shows_what_is_before_it() -> None:
     assert abs(mean) < 4 * error + 0.01
 
 
+@pytest.mark.slow
 def test_a_coat_shows_what_is_before_it() -> None:
     """A ball of black plastic under a sky: all that is seen of it is the sky in its coat, by one row of each pixel.
 

@@ -116,6 +116,7 @@ def z_scores(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 # -- against path -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pixels_of_a_corner_are_those_of_path() -> None:
     """A corner of three diffuse surfaces under a clamp that takes a tenth of the light.
 

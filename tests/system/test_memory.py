@@ -32,12 +32,13 @@ print(json.dumps([scene.n_vertices, report["peak_memory_bytes"] - before, report
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "plan",
     [
         ("exact", "gather", "direction", "5"),
-        pytest.param(("edges", "gather", "texel", "5"), marks=pytest.mark.slow),
-        pytest.param(("exact", "none", "texel", "2"), marks=pytest.mark.slow),
+        ("edges", "gather", "texel", "5"),
+        ("exact", "none", "texel", "2"),
     ],
     ids=lambda plan: "-".join(plan[:3]),
 )

@@ -63,7 +63,9 @@ def picture(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> 
     return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))[..., :3].astype(np.float64)
 
 
-@pytest.mark.parametrize("kind", ["diffuse", "glossy", pytest.param("holes", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["glossy", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("diffuse", "holes"))]
+)
 def test_shadows_of_a_sun_are_those_of_path(tmp_path, monkeypatch, kind):
     """Rationale: the ground's vertices are as far apart as the post is thick, and a texel is wider than the sun.
 

@@ -265,6 +265,7 @@ def test_cells_that_stand_for_others():
     assert np.mean(told) == pytest.approx(np.mean(errors), rel=0.2)
 
 
+@pytest.mark.slow
 def test_noise_is_averaged_out():
     """
     Expected: the same rays leave a good part less noise than before, it is as far off as is told, and no light is lost.
@@ -302,6 +303,7 @@ def test_noise_is_averaged_out():
     assert spread < 0.004
 
 
+@pytest.mark.slow
 def test_noise_of_its_own():
     """
     Expected: asked for a noise of its own, or one beside all light, a search stops at the first that it reaches; light
@@ -388,6 +390,7 @@ def test_light_is_told_apart_by_the_surfaces_it_met():
                 )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_held_out")
 def test_images_stop_light_where_paths_end():
     """Expected: a floor seen by way of glass, air and a half-open ball has the light that ``path`` leaves to it.
@@ -427,6 +430,7 @@ def test_images_stop_light_where_paths_end():
         assert means[0] == pytest.approx(means[1], rel=0.02)
 
 
+@pytest.mark.slow
 def test_no_more_rays_than_matter_beside_other_errors():
     """
     Scenario: a mirror over a floor. Paths of one sample leave far more noise than the 1.4% that is aimed at, 1024
@@ -453,6 +457,7 @@ def test_no_more_rays_than_matter_beside_other_errors():
     assert rays[0] < 0.5 * rays[1]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_held_out")
 def test_pixels_see_by_way_of_mirrors_and_glass():
     """Expected: at the points that a camera sees, light that is gathered is that of paths, and none is counted twice.

@@ -102,6 +102,7 @@ def test_ctrl_c_writes_nothing(monkeypatch, scene, tmp_path):
     assert entries(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_the_benchmark_measures_all_methods_and_draws(monkeypatch, scene, tmp_path):
     """Expected: every curve has points whose errors fall or are small, and JSON and figures are written.
 

@@ -32,6 +32,7 @@ def test_the_face_that_a_wall_stands_on(height):
     assert np.array_equal(found, below if height == 0 else np.zeros_like(below))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_rows_of_such_vertices_are_left_out():
     """

@@ -68,6 +68,7 @@ def test_cpca(tmp_path) -> None:
     assert "ball" in printed(cpca_tables(report))
 
 
+@pytest.mark.slow
 def test_moving_light(tmp_path) -> None:
     """What holds for any turn: more wavelets are better, those that go on better than those that start anew."""
     scene, effort = tiny(diffuse(0.7, 0.7, 0.7)), MovingEffort(20, 8, (60,), target_error=0.2)
@@ -132,6 +133,7 @@ def assert_pictures(found: dict) -> None:
     assert found["camera"]["size"] == (36, 48) and found["camera"]["nbytes"] > 0
 
 
+@pytest.mark.slow
 def test_glossy(tmp_path) -> None:
     """Brute force is slower than finite elements, and takes its direct light from the same rays."""
     effort = GlossyEffort(rows=8, spp=4, image_spp=8, image_width=48)

@@ -234,6 +234,7 @@ def test_rare_wrong_bits(exact, where):
     assert 0.67 < np.sqrt((errors**2).mean()) / found.std() < 1.5
 
 
+@pytest.mark.slow
 def test_a_target_far_off_takes_a_quarter(exact):
     """
     Expected: a quarter of the elements where the target is far off; estimates without bias (3 standard errors, that

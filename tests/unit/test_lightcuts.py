@@ -131,7 +131,8 @@ def test_no_node_sends_more_than_its_bound(matrix: Elements, whole: np.ndarray, 
     assert np.median(np.concatenate(ratios)) < 4
 
 
-@pytest.mark.parametrize("threshold", [pytest.param(0.1, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("threshold", [0.1, 0.02])
 def test_errors_are_about_the_threshold(matrix: Elements, whole: np.ndarray, threshold: float) -> None:
     """Five seeds. Expected: RMS of the samples' errors is about the threshold at most, fewer elements than all, and
     the mean is right within 4 standard errors and a tenth of the threshold (what is split depends on what was found).

@@ -44,6 +44,7 @@ def test_the_best_is_the_quickest_that_is_good_enough():
     assert not _against_best(0.02, auto(plans[1], 8.0, 0.0221), done)["met"]
 
 
+@pytest.mark.slow
 def test_every_plan_is_carried_out_that_may_be_as_quick(monkeypatch):
     """
     Expected: JSON and tables; each target's own plan is among those carried out, with what was predicted of it; what
