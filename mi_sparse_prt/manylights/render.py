@@ -42,7 +42,8 @@ from mi_sparse_prt.scene.unfolding import unfold_instances
 
 METHODS = "hasan2007", "adaptive"
 PROJECTED = 50  # dimensions of reduced columns ([HPB07] 4: r')
-COLUMNS_PER_ROW = 3  # within a time budget
+COLUMNS_PER_ROW = 1.0, 3.0  # within a time budget or an error; the most as [HPB07] 4.4 has it
+ROWS_SHARE = 0.2  # of what columns cost, that rows may, where these are cheap: few lights, many samples
 FEWEST = 16, 48  # rows and columns
 FIRST = 50  # rows, where an error is asked for
 GROWTH = 1.5, 4.0  # of rows and columns from one try to the next: the error falls about as they grow
@@ -133,7 +134,8 @@ def render_many_lights(
         Of any shapes that Mitsuba can intersect, instances and curves too; world units. A path is that of an XML file:
         of that, many instances become meshes first, as kernels of a thousand instances take minutes to compile.
     rows, columns : int
-        That are evaluated ([HPB07] recommends two or three columns for each row).
+        That are evaluated ([HPB07] recommends two or three columns for each row; ``seconds`` and ``error`` choose fewer
+        where samples outnumber lights, as rows are cheap then).
     seconds : float, optional
         Choose rows and columns by what they cost, to be done by then; compilation is not counted.
     sensor : int or mi.Sensor
@@ -258,10 +260,15 @@ class RowColumn:
     def _affordable(self, costs: Costs, seconds: float) -> tuple[int, int]:
         """Rows and columns that fit into what is left of so many seconds."""
         left = seconds - self.run.clock.report()["total"]
-        each = costs.row + COLUMNS_PER_ROW * (costs.column + costs.clustering)
+        each = costs.row + self._columns_per_row() * (costs.column + costs.clustering)
         rows = int(left / (each * (1 + RESERVE)))
-        rows, columns = max(rows, FEWEST[0]), max(COLUMNS_PER_ROW * rows, FEWEST[1])
+        rows, columns = max(rows, FEWEST[0]), max(round(self._columns_per_row() * rows), FEWEST[1])
         return min(rows, len(self.samples)), min(columns, len(self.lights))
+
+    def _columns_per_row(self) -> float:
+        """Columns for each row: a row has an element of each light, a column one of each sample."""
+        m, n = self.elements.shape
+        return float(np.clip(n / (ROWS_SHARE * m), *COLUMNS_PER_ROW))
 
     def reduced(self, rows: int) -> ReducedColumns:
         """Reduced columns of so many rows."""
@@ -356,7 +363,7 @@ class RowColumn:
         m, n = self.elements.shape
         rows, spent = float(FIRST), self.run.clock.report()["total"]
         while True:
-            self.rows, self.columns = min(round(rows), m), min(round(COLUMNS_PER_ROW * rows), n)
+            self.rows, self.columns = min(round(rows), m), min(round(self._columns_per_row() * rows), n)
             every = self.rows == m and self.columns == n
             self._announce()
             found = self.estimate_from(self.reduced(self.rows))

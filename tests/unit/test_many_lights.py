@@ -581,6 +581,17 @@ def test_a_time_budget_chooses_rows_and_columns(small_room: mi.Scene) -> None:
     assert found.report["seconds"]["total"] < 5
 
 
+@pytest.mark.parametrize(("lights", "columns"), [(100, 50), (3000, 150)])
+def test_rows_that_are_cheap_are_many(small_room: mi.Scene, lights: int, columns: int) -> None:
+    """
+    Rationale: a row has an element of each light, a column one of each sample, of which there are 509.
+    Expected: 50 rows first; of few lights, as many columns, of many, three for each row.
+    """
+    found = prt.render_many_lights(small_room, error=1e-9, seconds=1e-6, lights=lights, max_depth=2)
+    (tried,) = found.report["tries"]
+    assert (tried["rows"], tried["columns"]) == (50, columns)
+
+
 @pytest.mark.parametrize("method", ["adaptive", "hasan2007"])
 def test_layers_of_emitters_add_up_to_the_image(method: str) -> None:
     """A room with a lamp, a point and a sky: a layer for each, with what is seen of it.
