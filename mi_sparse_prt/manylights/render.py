@@ -42,7 +42,7 @@ from mi_sparse_prt.scene.unfolding import unfold_instances
 
 METHODS = "hasan2007", "adaptive"
 PROJECTED = 50  # dimensions of reduced columns ([HPB07] 4: r')
-COLUMNS_PER_ROW = 1.0, 3.0  # within a time budget or an error; the most as [HPB07] 4.4 has it
+COLUMNS_PER_ROW = 1.0, 3.0  # within a time budget or an error; most results of [HPB07] have 2 or 3
 ROWS_SHARE = 0.2  # of what columns cost, that rows may, where these are cheap: few lights, many samples
 FEWEST = 16, 48  # rows and columns
 FIRST = 50  # rows, where an error is asked for
