@@ -1,9 +1,9 @@
 """Direct light of glossy points, one row for each term of their BRDF; visibility is that of the point.
 
 ``T_k(x, j) = f_k(w_j in the frame of x) V(x, w_j) d_omega_j`` ([HR10] eq. 3), f_k of either sign. In the texel basis V
-is the visible share of the texel, and tables have means of f_k over discs as large as texels. Of a texel that the
-horizon cuts, only the part above it counts, and the height of that: many lobes are brightest near the horizon, where
-irradiance is next to nothing.
+is the visible share of the texel, and tables have means of f_k over discs as large as texels, or over what of these is
+above the horizon. Of a texel that the horizon cuts, only the part above it counts: many lobes are brightest near the
+horizon, where irradiance is next to nothing.
 """
 
 from __future__ import annotations
@@ -248,16 +248,15 @@ def _add(
 ) -> None:
     """Add weight times the values of a table (size, size, K) in direction (u, v, w), turned by a frame.
 
-    Of heights evenly around its own, as far as ``spread``, those above the horizon.
+    What it stands for has heights evenly around its own, as far as ``spread``: those above the horizon count.
 
     To total[place], whose length K is a multiple of LANES: loops of known length become vector instructions.
     """
     one, size = np.float32(1), table.shape[0]
     z = frame[2, 0] * u + frame[2, 1] * v + frame[2, 2] * w
-    least, most = max(z - spread, np.float32(0)), max(z + spread, np.float32(0))
     weight = weight * min(max(np.float32(0.5) * (one + z / spread), np.float32(0)), one)
     half = np.float32(0.5 * (size - 1))
-    scale = half / (one + np.float32(0.5) * (least + most))
+    scale = half / (one + max(z, np.float32(0)))
     a = (frame[0, 0] * u + frame[0, 1] * v + frame[0, 2] * w) * scale + half
     b = (frame[1, 0] * u + frame[1, 1] * v + frame[1, 2] * w) * scale + half
     column, row = min(max(int(a), 0), size - 2), min(max(int(b), 0), size - 2)

@@ -45,11 +45,11 @@ def test_texels_that_touch_the_horizon_from_below_send_nothing(direct):
     assert np.square(rows[:, ~above]).sum() < 1e-12 * np.square(rows[:, above]).sum()
 
 
-@pytest.mark.parametrize(("tilt", "worst"), [(0.0, 0.09), (4.0, 0.065), (33.0, 0.065)])
+@pytest.mark.parametrize(("tilt", "worst"), [(0.0, 0.09), (4.0, 0.065), (33.0, 0.06)])
 def test_rows_of_terms_are_those_of_rays(tilt, worst):
     """
-    Expected: radiance within 9, 6.5 and 6.5% of that by 16 x 16 rays in each texel.
-    Result: 7.6, 5.5 and 5.6%; by f_k at the centres of texels 17.7, 13.4 and 10.4%, and 75, 74 and 60% where
+    Expected: radiance within 9, 6.5 and 6% of that by 16 x 16 rays in each texel.
+    Result: 7.6, 5.4 and 4.9%; by f_k at the centres of texels 17.7, 13.4 and 10.4%, and 75, 74 and 60% where
         texels that the horizon cuts count as a whole.
     """
     found = matrix(floor(tilt), Plan("edges"))
