@@ -170,7 +170,7 @@ def _ends_of_long_edges(mesh: TriangleMesh, field: SizingField) -> NDArray[np.in
     a, b = (mesh.positions[ends].astype(np.float64) for ends in (start, end))
     length = np.linalg.norm(b - a, axis=1)
     some = np.flatnonzero(length > field.shortest * (1 + TIE))
-    ends: NDArray[np.int32] = start[some[length[some] > field((a[some] + b[some]) / 2)]]
+    ends: NDArray[np.int32] = start[some[length[some] > field((a[some] + b[some]) / 2) * (1 + TIE)]]
     return ends
 
 
