@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.threads import run_in_parts
 
 Floats = NDArray[np.float32]
+Sparse: TypeAlias = "scipy.sparse.csr_array | FactoredSparse"
 
 SLAB = 512  # columns of light at a time: more of it stays in the cache
 
 
-def multiply_sparse(matrix: scipy.sparse.csr_array, dense: Floats) -> Floats:
+def multiply_sparse(matrix: Sparse, dense: Floats) -> Floats:
     """A sparse matrix (n, m) times a dense one (m, k), float32; the same for any number of threads."""
     return multiply_scaled(matrix, np.ones((1, matrix.shape[1]), np.float32), dense)[0]
 
 
-def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats) -> Floats:
+def multiply_scaled(matrix: Sparse, albedo: Floats, light: Floats) -> Floats:
     """G rho x for several albedos rho and one light x, of which each row is read once for all of them.
 
     Parameters
     ----------
-    matrix : (n, m) sparse float32
+    matrix : (n, m) sparse float32, or kept as a product
         G.
     albedo : (channels, m) float32
         The diagonals of rho.
@@ -41,16 +45,18 @@ def multiply_scaled(matrix: scipy.sparse.csr_array, albedo: Floats, light: Float
     return result
 
 
-def add_scaled(
-    matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int
-) -> None:
+def add_scaled(matrix: Sparse, albedo: Floats, light: Floats, result: Floats, row: int) -> None:
     """Add what ``multiply_scaled`` returns to n rows of a result (channels, ..., at least k), from ``row`` on."""
     _multiply_into(matrix, albedo, light, result, row, True)
 
 
 def _multiply_into(
-    matrix: scipy.sparse.csr_array, albedo: Floats, light: Floats, result: Floats, row: int, add: bool
+    matrix: Sparse, albedo: Floats, light: Floats, result: Floats, row: int, add: bool
 ) -> None:
+    if isinstance(matrix, FactoredSparse):
+        _multiply_into(matrix.rest, albedo, light, result, row, add)
+        matrix.add_scaled(albedo, light, result, row)
+        return
     if light.shape[1] < 8:  # columns that are not worth a second thread
         part = result[:, row : row + matrix.shape[0], : light.shape[1]]
         found = np.stack([matrix @ (rho[:, None] * light) for rho in albedo])

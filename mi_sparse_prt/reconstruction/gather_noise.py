@@ -7,11 +7,10 @@ Light x that rays found is known again as y, from other rays of the same vertice
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
-from mi_sparse_prt.core.sparse_product import multiply_scaled
+from mi_sparse_prt.core.sparse_product import Sparse, multiply_scaled
 from mi_sparse_prt.reconstruction.surface_smoothing import SurfaceSmoothing, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.problem import Problem
@@ -53,7 +52,7 @@ class GatherNoise:
         self._smoothing = SurfaceSmoothing(smoothing_levels(scene, points, ids))
         self._chosen: NDArray[np.int8] | None = None
 
-    def judge(self, matrix: scipy.sparse.csr_array, light: Floats) -> None:
+    def judge(self, matrix: Sparse, light: Floats) -> None:
         """Choose how many levels of smoothing each node takes.
 
         Parameters
@@ -64,7 +63,7 @@ class GatherNoise:
             Random sums of columns of the light that surfaces receive.
         """
         rows, columns = self._others.shape
-        own = matrix if matrix.shape == self._others.shape else matrix[:rows, :columns]
+        own = matrix if matrix.shape == self._others.shape else matrix[np.arange(rows)][:, :columns]
         light = light[:columns]
         ours, others = (multiply_scaled(rays, self._albedo, light)[0] for rays in (own, self._others))
 

@@ -16,6 +16,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.sparse_product import Sparse
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.operator import Operator
@@ -65,7 +66,7 @@ class GlossyGather(FiniteElements):
 
     def __init__(
         self,
-        matrices: Sequence[Sequence[scipy.sparse.csr_array]],
+        matrices: Sequence[Sequence[Sparse]],
         albedo: Floats,
         problem: Problem,
         direct: FactoredVisibility,

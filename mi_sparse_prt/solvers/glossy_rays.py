@@ -1,7 +1,8 @@
 """What rays from vertices find of the light that glossy surfaces send out, and how much of it is noise.
 
 Rays are weighted by 1, for unit-albedo light, and by f_k(w) pi / cos, for the terms of a glossy vertex; what they meet
-sends out a diffuse part and g_l(w_o) times its own terms ([HR10] eq. 2-3): one sparse matrix over all of these.
+sends out a diffuse part and g_l(w_o) times its own terms ([HR10] eq. 2-3): one sparse matrix over all of these, which
+is kept as weights of rays times what each of them finds.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.core.threads import run_in_parts
+from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import combine_randomly
@@ -89,8 +90,8 @@ class GatherRays:
         From how far two halves of them differ, at some vertices and under random sums of columns, in one channel.
         """
         order = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
-        rows = np.where(direct.material[self.points] >= 0, 1 + direct.terms, 1)
-        entries = np.cumsum((rows * self.entries(direct.material, direct.terms))[order])
+        weights = np.where(direct.material[self.points] >= 0, 1 + direct.terms, 0) * self.counts
+        entries = np.cumsum((weights + self.entries(direct.material, direct.terms))[order])
         which = np.sort(order[: max(1, int(np.searchsorted(entries, NOISE_ENTRIES, side="right")))])
         ids, n = self.points[which], len(direct.material)
         light = np.empty((direct.shape[0], min(BITS, direct.shape[1])), np.float32)
@@ -98,7 +99,7 @@ class GatherRays:
         sent = light.copy()
         sent[:n] *= reflection.albedo.mean(axis=1)[:, None]
         x, y = (
-            gather_matrix(direct, self._half(which, half, direct.material), 0, ids) @ sent
+            multiply_sparse(gather_matrix(direct, self._half(which, half, direct.material), 0, ids), sent)
             for half in (False, True)
         )
         squares = np.zeros(3)
@@ -113,7 +114,7 @@ class GatherRays:
         return Noise(float(noise / bounce), float(bounce / every))
 
     def entries(self, material: NDArray[np.integer], terms: int) -> NDArray[np.int64]:
-        """How many numbers (n,) each row of a point is a sum of: what its rays meet, and the terms of that."""
+        """How many numbers (n,) the rays of each point find: what they meet, and the terms of that."""
         shiny = np.concatenate([[0], np.cumsum(material[self.seen] >= 0)])[row_starts(self.counts)]
         return self.counts + terms * np.diff(shiny)
 
@@ -135,7 +136,7 @@ class GatherRays:
         )
 
 
-def _squared_norm(gram: Floats, light: Floats) -> float:
+def _squared_norm(gram: Floats, light: NDArray[np.floating]) -> float:
     """Squared norm of the radiance of rows (k, R, columns) of points."""
     return float((gram * np.einsum("kaw,kbw->kab", light, light, optimize=True)).sum(dtype=np.float64))
 
@@ -195,65 +196,45 @@ def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.V
 
 def gather_matrix(
     direct: FactoredVisibility, rays: GatherRays, channel: int, nodes: NDArray[np.integer]
-) -> scipy.sparse.csr_array:
-    """G of one channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms."""
-    n, terms, rows = len(direct.material), direct.terms, len(nodes) + direct.shape[0] - len(direct.material)
-    number = np.full(n, -1)  # of a vertex among the glossy ones
-    number[direct.glossy] = np.arange(len(direct.glossy))
-    node = np.full(n, -1)  # and among the nodes
-    node[nodes] = np.arange(len(nodes))
-    own = slice(channel * terms, (channel + 1) * terms)
-    first = row_starts(rays.counts)
-    shiny = np.concatenate([[0], np.cumsum(number[rays.seen] >= 0)])[
-        first
-    ]  # rays of points before that meet such
-    entries = rays.entries(direct.material, terms)
-    lengths, glossy = np.zeros(rows, np.int64), number[rays.points] >= 0
-    is_node = node[rays.points] >= 0
-    lengths[node[rays.points[is_node]]] = entries[is_node]
-    of_terms = np.zeros(len(direct.glossy), np.int64)
-    of_terms[number[rays.points[glossy]]] = entries[glossy]
-    lengths[len(nodes) :] = np.repeat(of_terms, terms)
-    starts = row_starts(lengths)
+) -> FactoredSparse:
+    """G of one channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms.
+
+    Rows of a glossy vertex are sums over the same rays; those of a diffuse one are put together at once.
+    """
+    n, terms, glossy = len(direct.material), direct.terms, direct.material[rays.points] >= 0
+    shape = len(nodes) + direct.shape[0] - n, direct.shape[0]
+    node, number = _numbers(nodes, n), _numbers(direct.glossy, n)
+    of_terms = len(nodes) + number[rays.points[glossy]][:, None] * terms + np.arange(terms)
+    met, share = _met(direct, rays, channel), np.float32(1 / rays.per_vertex)
+    weights = share * np.column_stack([np.ones(len(rays.into), np.float32), rays.into])
+    rest = met[np.repeat(~glossy, rays.counts)]
+    lengths = np.zeros(shape[0], np.int64)
+    lengths[node[rays.points[~glossy]]] = rays.entries(direct.material, terms)[~glossy]
+    return FactoredSparse(
+        np.column_stack([node[rays.points[glossy]], of_terms]),
+        row_starts(rays.counts[glossy]),
+        weights,
+        met[np.repeat(glossy, rays.counts)],
+        scipy.sparse.csr_array((share * rest.data, rest.indices, row_starts(lengths)), shape=shape),
+    )
+
+
+def _numbers(ids: NDArray[np.integer], n: int) -> NDArray[np.int64]:
+    """The place of each of n vertices among some of them, -1 if it is not there."""
+    found = np.full(n, -1)
+    found[ids] = np.arange(len(ids))
+    return found
+
+
+def _met(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
+    """What each ray finds (rays, n): the light of a vertex and, if it is glossy, of all its terms."""
+    n, terms = len(direct.material), direct.terms
+    number = _numbers(direct.glossy, n)[rays.seen]
+    shiny = number >= 0
+    starts = row_starts(np.where(shiny, 1 + terms, 1))
     columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
-    into = row_starts(np.where(glossy, rays.counts, 0))
-    where = rays.points, first, into, shiny
-    found = rays.into, np.ascontiguousarray(rays.out[:, own]), np.float32(1 / rays.per_vertex)
-    numbers = number, node, len(nodes)
-    run_in_parts(_fill, len(rays.points), where, rays.seen, numbers, found, starts, columns, values)
-    return scipy.sparse.csr_array((values, columns, starts), shape=(rows, direct.shape[0]))
-
-
-@numba.njit(nogil=True, cache=True)
-def _fill(
-    first: int,
-    last: int,
-    where: tuple[NDArray[np.int64], ...],
-    seen: NDArray[np.int32],
-    numbers: tuple[NDArray[np.int64], NDArray[np.int64], int],
-    found: tuple[Floats, Floats, np.float32],
-    starts: NDArray[np.int64],
-    columns: NDArray[np.int32],
-    values: Floats,
-) -> None:
-    """Rows of each point: unit-albedo light, then its terms; entries of a ray likewise."""
-    (points, rays, first_into, first_out), (number, node, nodes) = where, numbers
-    into, out, share = found
-    n, terms = len(number), out.shape[1]
-    for i in range(first, last):
-        own = number[points[i]]
-        for row in range(1 + terms if own >= 0 else 1):
-            if row == 0 and node[points[i]] < 0:
-                continue
-            at = starts[node[points[i]]] if row == 0 else starts[nodes + own * terms + row - 1]
-            shiny = first_out[i]
-            for ray in range(rays[i], rays[i + 1]):
-                weight = share if row == 0 else share * into[first_into[i] + ray - rays[i], row - 1]
-                columns[at], values[at] = seen[ray], weight
-                at += 1
-                other = number[seen[ray]]
-                if other >= 0:
-                    for k in range(terms):
-                        columns[at], values[at] = n + other * terms + k, weight * out[shiny, k]
-                        at += 1
-                    shiny += 1
+    columns[starts[:-1]], values[starts[:-1]] = rays.seen, 1
+    places = starts[:-1][shiny][:, None] + 1 + np.arange(terms)
+    columns[places] = n + number[shiny][:, None] * terms + np.arange(terms)
+    values[places] = rays.out[:, channel * terms : (channel + 1) * terms]
+    return scipy.sparse.csr_array((values, columns, starts), shape=(len(rays.seen), direct.shape[0]))

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import mix
-from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled, multiply_sparse
+from mi_sparse_prt.core.sparse_product import Sparse, add_scaled, multiply_scaled, multiply_sparse
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.column_blocks import ColumnBlocks, combine_randomly
 from mi_sparse_prt.operators.low_rank import LowRank
@@ -119,7 +119,7 @@ class GatheredByDepth(ByDepth):
 class Averaging(Protocol):
     """Averages out noise of rays between neighbouring nodes (``reconstruction.gather_noise``)."""
 
-    def judge(self, matrix: scipy.sparse.csr_array, light: Floats) -> None: ...
+    def judge(self, matrix: Sparse, light: Floats) -> None: ...
 
     def averaged(self, light: Floats) -> Floats: ...
 
@@ -129,7 +129,7 @@ class FiniteElements:
 
     Parameters
     ----------
-    matrices : sequence of sequences of (n_nodes, n) sparse float32
+    matrices : sequence of sequences of (n_nodes, n) sparse float32, the first ones may be kept as products
         G_0, G_1, ... of each channel, or of all: form factors after so many specular surfaces; where light is not told
         apart by depth, only their sum counts.
     albedo : (channels, n) float32
@@ -158,7 +158,7 @@ class FiniteElements:
 
     def __init__(
         self,
-        matrices: Sequence[Sequence[scipy.sparse.csr_array]],
+        matrices: Sequence[Sequence[Sparse]],
         albedo: Floats,
         keys: NDArray[np.uint64],
         nodes: Nodes,
@@ -170,16 +170,13 @@ class FiniteElements:
         self.channels, self.options = len(albedo), LowRankOptions()
 
     @property
-    def matrix(self) -> scipy.sparse.csr_array:
+    def matrix(self) -> Sparse:
         return self._sums[0]
 
     @cached_property
-    def _sums(self) -> list[scipy.sparse.csr_array]:
+    def _sums(self) -> list[Sparse]:
         """G of each channel, or of all."""
-        return [
-            scipy.sparse.csr_array(sum(others, first)) if others else first
-            for first, *others in self._matrices
-        ]
+        return [sum(others, first) for first, *others in self._matrices]
 
     def apply(self, columns: Floats) -> Floats:
         """Indirect light under a few lights, without approximation.
@@ -254,7 +251,7 @@ class FiniteElements:
 
     @cached_property
     def _transposed(self) -> list[scipy.sparse.csr_array]:
-        return [matrix.T.tocsr() for matrix in self._sums]
+        return [matrix.tocsr().T.tocsr() for matrix in self._sums]
 
     def indirect(
         self, direct: Operator, tolerance: float = 0.03, specular: Operator | None = None

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.sparse_product import add_scaled, multiply_scaled
+from mi_sparse_prt.core.sparse_product import Sparse, add_scaled, multiply_scaled
 from mi_sparse_prt.operators.operator import Floats, Ids, Operator
 
 
@@ -84,9 +84,7 @@ class StackedFormFactors:
         All rows and columns.
     """
 
-    def __init__(
-        self, matrices: Sequence[scipy.sparse.csr_array], depths: Sequence[int] = (0,), count: int = 1
-    ) -> None:
+    def __init__(self, matrices: Sequence[Sparse], depths: Sequence[int] = (0,), count: int = 1) -> None:
         self._blocks = [
             [(i, matrices[s - t]) for i, t in enumerate(depths) if t <= s and matrices[s - t].nnz]
             for s in range(count)
