@@ -23,7 +23,7 @@ from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.factor_tables import outgoing_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.solvers.glossy_rays import Noise, gather_matrix, gather_rays
+from mi_sparse_prt.solvers.glossy_rays import Noise, gather_matrices, gather_rays
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.radiosity import (
     NEGLIGIBLE,
@@ -158,9 +158,8 @@ def glossy_indirect(
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))
     rows = nodes_and_terms(nodes, direct)
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
-    matrices = [
-        [gather_matrix(direct, rays, channel, nodes.ids), *after_mirrors] for channel in range(len(outgoing))
-    ]
+    first = gather_matrices(direct, rays, len(outgoing), nodes.ids)
+    matrices = [[matrix, *after_mirrors] for matrix in first]
     of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
     every, weights = np.hstack([albedo, of_terms]), problem.reflection.row_weights.mean(axis=1)
     solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import multiply_sparse
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.point_arrays import PointArrays
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import combine_randomly
@@ -99,7 +101,9 @@ class GatherRays:
         sent = light.copy()
         sent[:n] *= reflection.albedo.mean(axis=1)[:, None]
         x, y = (
-            multiply_sparse(gather_matrix(direct, self._half(which, half, direct.material), 0, ids), sent)
+            multiply_sparse(
+                gather_matrices(direct, self._half(which, half, direct.material), 1, ids)[0], sent
+            )
             for half in (False, True)
         )
         squares = np.zeros(3)
@@ -190,14 +194,17 @@ def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.V
     if not len(lanes):
         return np.empty((0, len(look_up(mi.UInt32(0), mi.Vector3f(0, 0, 1)))), np.float32)
     values = look_up(dr.gather(mi.UInt32, vertex, lanes), dr.gather(mi.Vector3f, direction, lanes))
-    dr.eval(values)
-    return np.stack([value.numpy() for value in values], axis=1)
+    count = len(values)  # side by side at once: to put columns together takes as long as to find them
+    found, place = dr.empty(mi.Float, count * len(lanes)), count * dr.arange(mi.UInt32, len(lanes))
+    for k, value in enumerate(values):
+        dr.scatter(found, value, place + k)
+    return found.numpy().reshape(-1, count)
 
 
-def gather_matrix(
-    direct: FactoredVisibility, rays: GatherRays, channel: int, nodes: NDArray[np.integer]
-) -> FactoredSparse:
-    """G of one channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms.
+def gather_matrices(
+    direct: FactoredVisibility, rays: GatherRays, channels: int, nodes: NDArray[np.integer]
+) -> list[FactoredSparse]:
+    """G of each channel: rows of nodes, then of terms, over unit-albedo light of all vertices and terms.
 
     Rows of a glossy vertex are sums over the same rays; those of a diffuse one are put together at once.
     """
@@ -205,18 +212,17 @@ def gather_matrix(
     shape = len(nodes) + direct.shape[0] - n, direct.shape[0]
     node, number = _numbers(nodes, n), _numbers(direct.glossy, n)
     of_terms = len(nodes) + number[rays.points[glossy]][:, None] * terms + np.arange(terms)
-    met, share = _met(direct, rays, channel), np.float32(1 / rays.per_vertex)
+    rows = np.column_stack([node[rays.points[glossy]], of_terms])
+    share, inner = np.float32(1 / rays.per_vertex), row_starts(rays.counts[glossy])
     weights = share * np.column_stack([np.ones(len(rays.into), np.float32), rays.into])
-    rest = met[np.repeat(~glossy, rays.counts)]
     lengths = np.zeros(shape[0], np.int64)
     lengths[node[rays.points[~glossy]]] = rays.entries(direct.material, terms)[~glossy]
-    return FactoredSparse(
-        np.column_stack([node[rays.points[glossy]], of_terms]),
-        row_starts(rays.counts[glossy]),
-        weights,
-        met[np.repeat(glossy, rays.counts)],
-        scipy.sparse.csr_array((share * rest.data, rest.indices, row_starts(lengths)), shape=shape),
+    starts = row_starts(lengths)
+    right, found = (
+        _met(direct, rays, np.flatnonzero(np.repeat(of, rays.counts)), channels) for of in (glossy, ~glossy)
     )
+    rest = [scipy.sparse.csr_array((share * x.data, x.indices, starts), shape=shape) for x in found]
+    return [FactoredSparse(rows, inner, weights, *own) for own in zip(right, rest, strict=True)]
 
 
 def _numbers(ids: NDArray[np.integer], n: int) -> NDArray[np.int64]:
@@ -226,15 +232,38 @@ def _numbers(ids: NDArray[np.integer], n: int) -> NDArray[np.int64]:
     return found
 
 
-def _met(direct: FactoredVisibility, rays: GatherRays, channel: int) -> scipy.sparse.csr_array:
-    """What each ray finds (rays, n): the light of a vertex and, if it is glossy, of all its terms."""
-    n, terms = len(direct.material), direct.terms
-    number = _numbers(direct.glossy, n)[rays.seen]
-    shiny = number >= 0
-    starts = row_starts(np.where(shiny, 1 + terms, 1))
-    columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
-    columns[starts[:-1]], values[starts[:-1]] = rays.seen, 1
-    places = starts[:-1][shiny][:, None] + 1 + np.arange(terms)
-    columns[places] = n + number[shiny][:, None] * terms + np.arange(terms)
-    values[places] = rays.out[:, channel * terms : (channel + 1) * terms]
-    return scipy.sparse.csr_array((values, columns, starts), shape=(len(rays.seen), direct.shape[0]))
+def _met(
+    direct: FactoredVisibility, rays: GatherRays, some: NDArray[np.int64], channels: int
+) -> list[scipy.sparse.csr_array]:
+    """What some rays find (rays, n), in each channel: the light of a vertex and, if it is glossy, of all its terms."""
+    number = _numbers(direct.glossy, len(direct.material))[rays.seen]
+    shiny = np.cumsum(number >= 0) - 1  # its place among rays that meet such
+    starts = row_starts(np.where(number[some] >= 0, 1 + direct.terms, 1))
+    columns, values = np.empty(starts[-1], np.int32), np.empty((channels, starts[-1]), np.float32)
+    met = rays.seen, number, shiny, rays.out.reshape(len(rays.out), -1, direct.terms)
+    run_in_parts(_fill, len(some), some, met, len(direct.material), starts, columns, values)
+    shape = len(some), direct.shape[0]
+    return [scipy.sparse.csr_array((own, columns, starts), shape=shape) for own in values]
+
+
+@numba.njit(nogil=True, cache=True)
+def _fill(
+    first: int,
+    last: int,
+    rays: NDArray[np.int64],
+    met: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], Floats],
+    n: int,
+    starts: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    values: Floats,
+) -> None:
+    seen, number, shiny, out = met
+    terms = out.shape[2]
+    for i in range(first, last):
+        ray, at = rays[i], starts[i]
+        columns[at], values[:, at] = seen[ray], 1
+        if number[ray] >= 0:
+            for k in range(terms):
+                columns[at + 1 + k] = n + number[ray] * terms + k
+                for c in range(len(values)):
+                    values[c, at + 1 + k] = out[shiny[ray], c, k]
