@@ -117,6 +117,11 @@ class PilotElements:
             self._norm += exact - self._direct_norm
             self._direct_norm = exact
 
+    def shares_of(self, count: int) -> NDArray[np.int64]:
+        """How often each vertex (k,) is among so many that stand for all vertices alike."""
+        ends = np.rint(np.cumsum(self.stand_for) / self.stand_for.sum() * count).astype(np.int64)
+        return np.diff(ends, prepend=0)
+
     def paths(self, max_depth: int, spp: int = SPP) -> Halves:
         """Indirect light at these elements, up to some depth."""
         solver, seeds = PathSolver(replace(self.problem, max_depth=max_depth), spp), self._seeds[2:]

@@ -143,8 +143,10 @@ class Execution:
         """Strata of all texels, more of those that are seen in part."""
         elements = len(self._solver.points) * self._solver.lighting.n_directions
         with self._run.clock.phase("direct"):
-            part, rays = adaptive_visibility(self._problem, strata, self._run.seed)
-        return MethodResult(part, None, elements, {"direct": elements, "indirect": 0}, {"direct": rays})
+            part, traced = adaptive_visibility(self._problem, strata, self._run.seed)
+        return MethodResult(
+            part, None, elements, {"direct": elements, "indirect": 0}, {"direct": int(traced.sum())}
+        )
 
     def _centres(self, solver: DirectSolver) -> MethodResult:
         """Which texels' centres are seen; rays that looked for light that surfaces let through may know."""

@@ -63,17 +63,17 @@ def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
 
 def edges_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:
     """Texels' centres, and rays along edges of visibility, in the texel basis."""
-    problem, count = replace(direct.problem, basis="direction"), len(held.vertices)
+    problem = replace(direct.problem, basis="direction")
     centres = len(direct.points) * seconds_per_row(DirectSolver(problem))
     # as often that one launch of a kernel is next to nothing, as it is for all points
-    some = DirectSolver(problem.at(points_at(direct.points, np.tile(held.vertices, EDGES_TIMED))))
-    places = np.arange(count)
-    bits = np.tile(some.rows(places).astype(np.uint32, copy=False), (EDGES_TIMED, 1))
-    part, _ = fractional_visibility(some, bits)
+    ids = np.repeat(held.vertices, held.shares_of(EDGES_TIMED * len(held.vertices)))
+    timed = DirectSolver(problem.at(points_at(direct.points, ids)))
+    bits = timed.rows(np.arange(len(ids))).astype(np.uint32, copy=False)
+    error = edges_error(direct, held)  # compiles, too
     start = time.perf_counter()
-    fractional_visibility(some, bits)
-    edges = (time.perf_counter() - start) * len(direct.points) / len(bits)
-    return DirectCost(centres + edges, math.sqrt(held.squared_error_of_shares(part)), centres)
+    fractional_visibility(timed, bits)
+    edges = (time.perf_counter() - start) * len(direct.points) / len(ids)
+    return DirectCost(centres + edges, error, centres)
 
 
 def edges_error(direct: DirectSolver, held: PilotElements) -> float:
@@ -97,11 +97,11 @@ def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: i
         costs += some
     good = max(aim, min(cost.error for cost in costs) / MINIMUM_GAIN)
     best = min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
-    return replace(best, seconds=best.seconds * each * len(direct.points) / len(held.vertices))
+    return replace(best, seconds=best.seconds * each)
 
 
 def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> tuple[list[DirectCost], float]:
-    """Of a pilot's points, with rays in place of seconds; and seconds of a ray.
+    """Of all that a pilot's points stand for, with rays in place of seconds; and seconds of a ray.
 
     The last rays say what one takes: they are most, and no kernel is compiled for them.
     """
@@ -109,16 +109,16 @@ def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> t
     for across in (ACROSS[0], ACROSS[-1]):
         start = time.perf_counter()
         part, traced = adaptive_visibility(few, Strata(first, across), seed)
-        each = (time.perf_counter() - start) / max(traced, 1)
-        rays.append(traced)
+        each = (time.perf_counter() - start) / max(int(traced.sum()), 1)
+        rays.append(float(held.stand_for @ traced))
         squares.append(held.squared_error_of_shares(part))
     falls, grows = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
     fall = max(squares[0] - squares[1], 0.0) / (falls[0] - falls[-1])
     rise = (rays[1] - rays[0]) / (grows[-1] - grows[0])
     for across, falling, growing in zip(ACROSS, falls, grows, strict=True):
         square = fall * falling + max(squares[1] - fall * falls[-1], 0.0)
-        traced = rays[0] + rise * (growing - grows[0])
-        costs.append(DirectCost(float(traced), math.sqrt(square), strata=Strata(first, across)))
+        traced = rays[0] + float(rise * (growing - grows[0]))
+        costs.append(DirectCost(traced, math.sqrt(square), strata=Strata(first, across)))
     return costs, each
 
 

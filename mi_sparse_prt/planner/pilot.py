@@ -11,7 +11,13 @@ from mi_sparse_prt.estimation.held_out import ROUND
 from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import MARGIN, Costs, choose, predictions
-from mi_sparse_prt.planner.direct_costs import adaptive_cost, consensus_cost, edges_cost, exact_cost
+from mi_sparse_prt.planner.direct_costs import (
+    MINIMUM_GAIN,
+    adaptive_cost,
+    consensus_cost,
+    edges_cost,
+    exact_cost,
+)
 from mi_sparse_prt.planner.path_costs import (
     COARSEST,
     coarse_resolutions,
@@ -57,9 +63,6 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
         light["consensus"] = consensus_cost(direct, held, seed)
     elif auto:
         light["edges"] = edges_cost(direct, held)
-        aim = MARGIN * (settings.target_error or TARGET) / math.sqrt(2)  # half of its square
-        if min(cost.error for cost in light.values()) > aim:
-            light["adaptive"] = adaptive_cost(direct, held, aim, seed)
     check = _check(held)
     # light by way of mirrors and glass is not among the elements
     dark = not problem.specular_apart and held.light() <= DARK
@@ -67,18 +70,45 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     if settings.target_error is not None:
         costs = replace(costs, fixed=(1 + ROUND) * check, check=check)
     if not indirect:
-        return costs
+        return _with_adaptive(costs, direct, held, settings)
     path = seconds_of_a_path(problem, settings, lighting)
     fine, asked = lighting.resolution, settings.indirect_resolution
     costs = replace(costs, paths=path_costs(problem, settings, held, path, [asked or fine]))
     if auto:
         costs = replace(costs, gather=gather_costs(direct, held, seed))
+    costs = _with_adaptive(costs, direct, held, settings)
     if auto and settings.basis == "direction" and asked in (None, fine):
         sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
         costs = replace(costs, sparse=sparse)
     if asked is None and not dark and not (auto and _too_dear(costs, settings, path, noise_of_a_path(held))):
         every = [*coarse_resolutions(fine), fine]
         costs = replace(costs, paths=path_costs(problem, settings, held, path, every))
+    return costs
+
+
+def _with_adaptive(costs: Costs, direct: DirectSolver, held: PilotElements, settings: Settings) -> Costs:
+    """Adaptive strata as well, where other direct light is not good enough.
+
+    A floor below indirect light, where paths take too long, leaves nothing to gain from direct light that is clearly
+    better than it.
+    """
+    if settings.method != "auto" or settings.basis == "direction":
+        return costs
+    target = MARGIN * (settings.target_error or TARGET)
+    aim = target / math.sqrt(2)  # half of its square
+    if costs.gather is not None and costs.paths is not None:
+        floor = costs.gather.growth * costs.gather.bias
+        paths = (
+            costs.paths.samples(at, target)
+            * each
+            * (COARSEST / at) ** 2  # were the coarsest ones good enough
+            for at, each in costs.paths.seconds.items()
+        )
+        if floor > target and min(paths) > settings.max_seconds:
+            aim = max(aim, floor * math.sqrt(MINIMUM_GAIN**-2 - 1))
+    if min(cost.error for cost in costs.direct.values()) > aim:
+        adaptive = adaptive_cost(direct, held, aim, settings.seed)
+        costs = replace(costs, direct={**costs.direct, "adaptive": adaptive})
     return costs
 
 

@@ -49,7 +49,9 @@ class Strata(NamedTuple):
     across: int = 4
 
 
-def adaptive_visibility(problem: Problem, strata: Strata, seed: int) -> tuple[FractionalVisibility, int]:
+def adaptive_visibility(
+    problem: Problem, strata: Strata, seed: int
+) -> tuple[FractionalVisibility, NDArray[np.int64]]:
     """Visible shares of all texels, from strata of these.
 
     Parameters
@@ -62,8 +64,8 @@ def adaptive_visibility(problem: Problem, strata: Strata, seed: int) -> tuple[Fr
     Returns
     -------
     FractionalVisibility
-    int
-        Rays that were traced, or would have been but for the horizon.
+    (n,) int64
+        Rays of each point that were traced, or would have been but for the horizon.
 
     Notes
     -----
@@ -74,7 +76,7 @@ def adaptive_visibility(problem: Problem, strata: Strata, seed: int) -> tuple[Fr
     seeds = element_seeds(random_stream(seed, ADAPTIVE), 2)
     first, second = (DirectSolver(problem, *one) for one in zip(strata, seeds, strict=True))
     near = np.ascontiguousarray(np.hstack([lighting.sides.tables.beside, lighting.sides.tables.across]))
-    blocks, rays = [], 0
+    blocks, rays = [], np.zeros(len(points), np.int64)
     for a in range(0, max(len(points), 1), step):
         ids = np.arange(a, min(a + step, len(points)), dtype=np.uint32)
         shares = first.shares(np.repeat(ids, size), np.tile(np.arange(size, dtype=np.uint32), len(ids)))
@@ -82,7 +84,7 @@ def adaptive_visibility(problem: Problem, strata: Strata, seed: int) -> tuple[Fr
         mixed = np.zeros(shares.shape, np.bool_)
         run_in_parts(_mark_mixed, len(ids), strata.first, shares, near, mixed)
         row, texel = np.nonzero(mixed)
-        rays += strata.first**2 * int((shares >= 0).sum()) + strata.across**2 * len(row)
+        rays[ids] = strata.first**2 * (shares >= 0).sum(axis=1) + strata.across**2 * mixed.sum(axis=1)
         shares[row, texel] = second.shares(ids[row], texel.astype(np.uint32))
         blocks.append(_listed(shares))
     seen, number, texels, parts = (np.concatenate(column) for column in zip(*blocks, strict=True))

@@ -62,7 +62,7 @@ def test_few_rays_where_little_is_seen_in_part(first):
     found, rays = adaptive_visibility(problem, Strata(first, 6), 5)
     ours = found.rows(np.arange(len(problem.points)))[..., 0]
     assert error_of(ours, x, y) < 1.25 * error_of(rows(problem, 6, 7), x, y)
-    assert rays < 6**2 * x.size / 4
+    assert rays.sum() < 6**2 * x.size / 4
 
 
 @pytest.mark.parametrize(("gap", "across"), [(0.5, 4), (0.5, 8), (0.2, 6)])
@@ -106,7 +106,7 @@ def test_the_same_for_any_block_of_points(monkeypatch):
     whole, rays = adaptive_visibility(problem, Strata(across=3), 1)
     monkeypatch.setattr(adaptive_strata, "ELEMENTS", 7 * LIGHTING.n_directions)
     parts, as_many = adaptive_visibility(problem, Strata(across=3), 1)
-    assert rays == as_many
+    assert np.array_equal(rays, as_many)
     for name in ("bits", "starts", "texels", "shares"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
     other, _ = adaptive_visibility(problem, Strata(across=3), 2)
@@ -122,7 +122,7 @@ def test_no_points():
     problem = floor_of(under_slats(0.6, 0.5))
     none = problem.at(Points(*(x[:0] for x in vars(problem.points).values())))
     found, rays = adaptive_visibility(none, Strata(across=3), 1)
-    assert found.shape == (0, LIGHTING.n_directions, 1) and rays == 0
+    assert found.shape == (0, LIGHTING.n_directions, 1) and len(rays) == 0
 
 
 def test_below_the_horizon_nothing_is_seen():
@@ -132,8 +132,8 @@ def test_below_the_horizon_nothing_is_seen():
     ours, truth = found.rows(np.arange(len(problem.points)))[..., 0], rows(problem, 16, 3)
     assert np.abs(ours - truth).max() < 0.02 * truth.max()
     one, fewer = adaptive_visibility(problem, Strata(1, 4), 1)
-    assert np.array_equal(one.bits, found.bits) and fewer == rays / 4
-    assert rays == 4 * (len(problem.points) * LIGHTING.n_directions) // 2
+    assert np.array_equal(one.bits, found.bits) and np.array_equal(4 * fewer, rays)
+    assert np.all(rays == 4 * LIGHTING.n_directions // 2)
 
 
 def test_light_that_passes_slats_is_not_in_their_way():
