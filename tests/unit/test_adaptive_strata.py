@@ -23,7 +23,7 @@ T = mi.ScalarTransform4f
 LIGHTING = prt.CubemapLighting(8)
 
 
-def under_slats(pitch: float, gap: float, bsdf: dict | None = None) -> Scene:
+def under_slats(pitch: float, gap: float, bsdf: dict | None = None, beside: dict | None = None) -> Scene:
     """A floor of 2 x 2 under slats at a height of 1, with gaps of a share of their pitch."""
     slats = {
         f"slat_{k}": {
@@ -166,3 +166,27 @@ def test_strata_that_a_pilot_chooses():
         found = prt.precompute(scene, LIGHTING, plan, "texel", max_depth=2, progress=False)
         assert found.report["plan"]["parameters"] == {"strata": cost.strata._asdict()}
         assert cost.error == pytest.approx(found.report["estimated_error"]["total"], rel=0.25)
+
+
+def test_points_of_a_pilot_stand_for_those_of_their_mesh():
+    """
+    Scenario: a floor under a board, and an open one with many more points; a pilot looks at as many of each.
+    Expected: rays that it predicts for all points, within 10%. Were each of its points one of as many, they would be
+        30% more at the least; a choice of points, each as often as it stands for others, has the right share of both.
+    """
+    grey, to_world = (
+        diffuse(0.5, 0.5, 0.5),
+        [T().translate([0, 0, 1]).scale(0.5), T().translate([50, 0, 0]).scale(5)],
+    )
+    shapes = [{"type": "rectangle", "bsdf": grey} | ({"to_world": t} if t else {}) for t in (None, *to_world)]
+    scene = build(0.2, optimize=False, floor=shapes[0], board=shapes[1], wide=shapes[2])
+    direct = DirectSolver(problem_at(scene, LIGHTING, basis="texel"))
+    held = PilotElements(direct.problem, False, 0, 64, 8)
+    n, strata = len(direct.points), Strata(1, 6)
+    rays = adaptive_visibility(direct.problem, strata, 0)[1].sum()
+    some = adaptive_visibility(direct.problem.at(points_at(direct.points, held.vertices)), strata, 0)[1]
+    assert held.stand_for.sum() == pytest.approx(n)
+    assert held.stand_for @ some == pytest.approx(rays, rel=0.1)
+    assert some.mean() * n > 1.3 * rays
+    often = held.shares_of(1000)
+    assert often.sum() == 1000 and np.abs(often - 1000 * held.stand_for / n).max() <= 1
