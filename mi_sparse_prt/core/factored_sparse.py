@@ -10,6 +10,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.threads import run_in_parts
 
 Floats = NDArray[np.float32]
@@ -60,10 +62,10 @@ class FactoredSparse:
         """Some rows, multiplied out."""
         group, place = self._places[:, ids]
         counts = np.where(group >= 0, np.diff(self.inner, append=0)[group], 0)
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        starts = row_starts(counts)
         columns = np.arange(starts[-1]) - np.repeat(starts[:-1] - self.inner[group], counts)
-        entries = self.weights[columns, np.repeat(place, counts)], columns, starts
-        left = scipy.sparse.csr_array(entries, shape=(len(ids), self.right.shape[0]))
+        weights = self.weights[columns, np.repeat(place, counts)]
+        left = sparse_of_rows(weights, columns, starts, self.right.shape[0])
         return scipy.sparse.csr_array(self.rest[ids] + left @ self.right)
 
     def tocsr(self) -> scipy.sparse.csr_array:

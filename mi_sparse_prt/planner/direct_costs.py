@@ -117,8 +117,8 @@ def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> t
     rise = (rays[1] - rays[0]) / (grows[-1] - grows[0])
     for across, falling, growing in zip(ACROSS, falls, grows, strict=True):
         square = fall * falling + max(squares[1] - fall * falls[-1], 0.0)
-        traced = rays[0] + float(rise * (growing - grows[0]))
-        costs.append(DirectCost(traced, math.sqrt(square), strata=Strata(first, across)))
+        every = rays[0] + float(rise * (growing - grows[0]))
+        costs.append(DirectCost(every, math.sqrt(square), strata=Strata(first, across)))
     return costs, each
 
 

@@ -30,10 +30,11 @@ DENSE, HUANG_DENSE = 0.22, 0.3  # share of the vertices whose rows are known, wh
 
 
 class _Gathered(NamedTuple):
-    """Rays of all vertices that meet a surface, and entries of G that they make."""
+    """Rays of all vertices that meet a surface, what these find, and what those of glossy vertices weigh in terms."""
 
     hits: float
     entries: float
+    weights: float = 0.0
 
 
 def peak_bytes(direct: DirectSolver, paths: PathSolver, plan: Plan, indirect: bool) -> float:
@@ -90,7 +91,7 @@ def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     if terms:
         colours = channels if channels == 1 else 3
         of_rays = found.hits * 4 * (6 + 1 + terms + colours * terms)
-        matrix = ENTRY * found.entries
+        matrix = 4 * (found.weights + (1 + colours) * found.entries)  # channels share columns
         low_rank = 4 * rows * rank * (3 + colours - 1)
         return max(2 * of_rays, of_rays + matrix + drawn + basis + low_rank)
     low_rank = 4 * channels * rank * (2 * nodes + n)
@@ -107,4 +108,7 @@ def _rays_that_meet(direct: DirectSolver, rays: int) -> _Gathered:
     rows = np.ones(n)
     rows[problem.reflection.glossy] += problem.reflection.terms
     hits = rays * found
-    return _Gathered(scale * float(hits.sum()), scale * float(rows[some] @ (hits @ rows)))
+    own = np.where(rows > 1, rows, 0)[some]
+    return _Gathered(
+        scale * float(hits.sum()), scale * float((hits @ rows).sum()), scale * float(own @ hits.sum(axis=1))
+    )

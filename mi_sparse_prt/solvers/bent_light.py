@@ -7,6 +7,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.ragged import row_starts
+from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.problem import Problem
@@ -108,8 +110,7 @@ def _spread(matrix: Sparse, rows: Ids, shape: tuple[int, int]) -> Sparse:
     """A matrix with more rows, of which some are those of another."""
     counts = np.zeros(shape[0], np.int64)
     counts[rows] = np.diff(matrix.indptr)
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    return scipy.sparse.csr_array((matrix.data, matrix.indices, starts), shape=shape)
+    return sparse_of_rows(matrix.data, matrix.indices, row_starts(counts), shape[1])
 
 
 class _Moments:

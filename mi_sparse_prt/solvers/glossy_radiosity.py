@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.random_keys import mix
 from mi_sparse_prt.core.sparse_product import Sparse
 from mi_sparse_prt.operators.by_depth import ByDepth
@@ -151,20 +152,28 @@ def glossy_indirect(
     """
     assert isinstance(problem.reflection, InOutFactors)
     albedo, outgoing = _channels(problem.reflection)
-    points = np.union1d(nodes.ids, direct.glossy)
     rays_per_vertex, tolerance, seed = effort
-    rays = gather_rays(problem, outgoing, rays_per_vertex, seed, points)
-    noise = rays.noise(direct, problem.reflection, problem.points, seed)
+    first, noise = _form_factors(problem, direct, nodes, outgoing, effort)
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))
     rows = nodes_and_terms(nodes, direct)
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
-    first = gather_matrices(direct, rays, len(outgoing), nodes.ids)
     matrices = [[matrix, *after_mirrors] for matrix in first]
     of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
     every, weights = np.hstack([albedo, of_terms]), problem.reflection.row_weights.mean(axis=1)
     solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)
     solver.averaging = averaging
     return solver.indirect(direct, tolerance, specular), noise
+
+
+def _form_factors(
+    problem: Problem, direct: FactoredVisibility, nodes: Nodes, outgoing: Floats, effort: GatherEffort
+) -> tuple[list[FactoredSparse], Noise]:
+    """G_0 of each channel, and the noise of its rays, which are not kept: they take as much memory."""
+    assert isinstance(problem.reflection, InOutFactors)
+    points = np.union1d(nodes.ids, direct.glossy)
+    rays = gather_rays(problem, outgoing, effort.rays_per_vertex, effort.seed, points)
+    noise = rays.noise(direct, problem.reflection, problem.points, effort.seed)
+    return gather_matrices(direct, rays, len(outgoing), nodes.ids), noise
 
 
 def _after_mirrors(

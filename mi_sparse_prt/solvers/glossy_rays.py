@@ -22,6 +22,7 @@ from mi_sparse_prt.core.bits import BITS
 from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
+from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.point_arrays import PointArrays
@@ -221,7 +222,7 @@ def gather_matrices(
     right, found = (
         _met(direct, rays, np.flatnonzero(np.repeat(of, rays.counts)), channels) for of in (glossy, ~glossy)
     )
-    rest = [scipy.sparse.csr_array((share * x.data, x.indices, starts), shape=shape) for x in found]
+    rest = [sparse_of_rows(share * x.data, x.indices, starts, shape[1]) for x in found]
     return [FactoredSparse(rows, inner, weights, *own) for own in zip(right, rest, strict=True)]
 
 
@@ -239,11 +240,13 @@ def _met(
     number = _numbers(direct.glossy, len(direct.material))[rays.seen]
     shiny = np.cumsum(number >= 0) - 1  # its place among rays that meet such
     starts = row_starts(np.where(number[some] >= 0, 1 + direct.terms, 1))
-    columns, values = np.empty(starts[-1], np.int32), np.empty((channels, starts[-1]), np.float32)
-    met = rays.seen, number, shiny, rays.out.reshape(len(rays.out), -1, direct.terms)
-    run_in_parts(_fill, len(some), some, met, len(direct.material), starts, columns, values)
-    shape = len(some), direct.shape[0]
-    return [scipy.sparse.csr_array((own, columns, starts), shape=shape) for own in values]
+    columns, found = np.empty(starts[-1], np.int32), list[scipy.sparse.csr_array]()
+    out = rays.out.reshape(len(rays.out), -1, direct.terms)
+    for channel in range(channels):
+        met, values = (rays.seen, number, shiny, out, channel), np.empty(starts[-1], np.float32)
+        run_in_parts(_fill, len(some), some, met, len(direct.material), starts, columns, values)
+        found.append(sparse_of_rows(values, columns, starts, direct.shape[0]))  # all have the same columns
+    return found
 
 
 @numba.njit(nogil=True, cache=True)
@@ -251,19 +254,18 @@ def _fill(
     first: int,
     last: int,
     rays: NDArray[np.int64],
-    met: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], Floats],
+    met: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], Floats, int],
     n: int,
     starts: NDArray[np.int64],
     columns: NDArray[np.int32],
     values: Floats,
 ) -> None:
-    seen, number, shiny, out = met
+    seen, number, shiny, out, channel = met
     terms = out.shape[2]
     for i in range(first, last):
         ray, at = rays[i], starts[i]
-        columns[at], values[:, at] = seen[ray], 1
+        columns[at], values[at] = seen[ray], 1
         if number[ray] >= 0:
             for k in range(terms):
                 columns[at + 1 + k] = n + number[ray] * terms + k
-                for c in range(len(values)):
-                    values[c, at + 1 + k] = out[shiny[ray], c, k]
+                values[at + 1 + k] = out[shiny[ray], channel, k]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix, random_generator
+from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
@@ -482,7 +483,7 @@ def _summed(
     rows = np.repeat(np.arange(shape[0]), np.diff(starts))
     kept = np.arange(len(columns)) - starts[rows] < counts[rows]
     pointers, indices = row_starts(counts), found[kept]
-    return [scipy.sparse.csr_array((v, indices, pointers), shape=shape) for v in sums[kept].T.copy()]
+    return [sparse_of_rows(v.copy(), indices, pointers, shape[1]) for v in sums[kept].T]
 
 
 @numba.njit(nogil=True, cache=True)

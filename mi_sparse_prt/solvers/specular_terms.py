@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
+from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.bent_light import LEAST_SHARE
@@ -196,7 +197,7 @@ def _rows_of_terms(found: _Light, shape: tuple[int, int]) -> list[Sparse]:
     count, terms = found.into.shape
     columns = (found.rows[:, None] * terms + np.arange(terms)).ravel()
     starts = np.arange(0, count * terms + 1, terms)
-    into = scipy.sparse.csr_array((found.into.ravel(), columns, starts), shape=(count, shape[0]))
+    into = sparse_of_rows(found.into.ravel(), columns, starts, shape[0])
     into = scipy.sparse.csr_array(into.T)  # [term of a point, end]
     grey = bool((found.light == found.light[:, :1]).all())
     matrices = []
