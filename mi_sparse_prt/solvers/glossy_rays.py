@@ -241,7 +241,7 @@ def _met(
     shiny = np.cumsum(number >= 0) - 1  # its place among rays that meet such
     starts = row_starts(np.where(number[some] >= 0, 1 + direct.terms, 1))
     columns, found = np.empty(starts[-1], np.int32), list[scipy.sparse.csr_array]()
-    out = rays.out.reshape(len(rays.out), -1, direct.terms)
+    out = rays.out.reshape(len(rays.out), rays.out.shape[1] // direct.terms, direct.terms)
     for channel in range(channels):
         met, values = (rays.seen, number, shiny, out, channel), np.empty(starts[-1], np.float32)
         run_in_parts(_fill, len(some), some, met, len(direct.material), starts, columns, values)
