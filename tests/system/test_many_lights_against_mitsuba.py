@@ -224,6 +224,7 @@ def test_the_same_error_is_predicted_and_found() -> None:
     assert 1 / 1.5 < ratio < 1.5
 
 
+@pytest.mark.slow
 def test_millions_of_triangles_by_instances() -> None:
     """A scene of more than two million triangles, instances of one mesh, which tessellation would refuse.
 

@@ -182,7 +182,7 @@ def test_regions_are_those_of_path(name: str) -> None:
     assert np.all((np.abs(z_scores(*quarters)) < 4) | (np.abs(off) < 0.002))
 
 
-@pytest.mark.parametrize("depth", [3, pytest.param(4, marks=pytest.mark.slow), -1])
+@pytest.mark.parametrize("depth", [*(pytest.param(depth, marks=pytest.mark.slow) for depth in (3, 4)), -1])
 def test_depths_are_those_of_path(depth: int) -> None:
     """A corner before a mirror, at some depths.
 

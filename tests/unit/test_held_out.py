@@ -116,7 +116,9 @@ def flipped(transport: LightTransport, one_of: int, seed: int) -> LightTransport
 
 
 @pytest.mark.parametrize(
-    ("basis", "coarse"), [("direction", None), ("texel", 2)], ids=["direction", "texel, coarse indirect"]
+    ("basis", "coarse"),
+    [("direction", None), pytest.param("texel", 2, marks=pytest.mark.slow)],
+    ids=["direction", "texel, coarse indirect"],
 )
 def test_the_estimate_covers_the_true_error(grey_scene, basis, coarse):
     """Matrices of 6 seeds: the true error lies within two of the reported standard errors, in total and per mesh.
@@ -266,7 +268,7 @@ def test_a_target_far_off_takes_a_quarter(exact):
     ("method", "basis"),
     [
         pytest.param("brute_force", "direction", marks=pytest.mark.slow),
-        ("brute_force", "texel"),
+        pytest.param("brute_force", "texel", marks=pytest.mark.slow),
         ("sparse", "direction"),
         pytest.param("huang2010", "direction", marks=pytest.mark.slow),
     ],

@@ -74,6 +74,7 @@ def test_few_elements_stand_for_all():
     assert (weights == 1).all()
 
 
+@pytest.mark.slow
 def test_the_error_of_a_matrix_of_lamps_next_to_surfaces_is_told():
     """Rationale: a post under a ball that shines has most of its light, and a few points drawn evenly miss it.
 

@@ -44,7 +44,7 @@ def settings(**given) -> Settings:
     return Settings(LIGHTING.resolution, basis="texel", **given)
 
 
-@pytest.mark.parametrize("kind", ["terms", "pixels"])
+@pytest.mark.parametrize("kind", ["terms", pytest.param("pixels", marks=pytest.mark.slow)])
 def test_narrow_slats_take_strata(kind):
     """
     Rationale: under slats of a quarter of a texel edges are a tenth off, and no plan with more rays mends that.
