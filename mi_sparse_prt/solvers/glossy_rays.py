@@ -260,6 +260,7 @@ def _fill(
     columns: NDArray[np.int32],
     values: Floats,
 ) -> None:
+    """Columns and values of what each ray finds, the diffuse part of a vertex first, in one channel."""
     seen, number, shiny, out, channel = met
     terms = out.shape[2]
     for i in range(first, last):

@@ -1,6 +1,7 @@
 """Visible areas of texels by strata: against many more rays, for what is finer than texels, and what they cost."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,10 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.mean_cosine import MeanCosine
-from mi_sparse_prt.planner.direct_costs import adaptive_cost, points_at
+from mi_sparse_prt.planner import pilot
+from mi_sparse_prt.planner.choice import Costs
+from mi_sparse_prt.planner.direct_costs import DirectCost, adaptive_cost, points_at
+from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers import adaptive_strata
 from mi_sparse_prt.solvers.adaptive_strata import ACROSS, Strata, adaptive_visibility
@@ -190,3 +194,30 @@ def test_points_of_a_pilot_stand_for_those_of_their_mesh():
     assert some.mean() * n > 1.3 * rays
     often = held.shares_of(1000)
     assert often.sum() == 1000 and np.abs(often - 1000 * held.stand_for / n).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("bias", "path", "aim"),
+    [
+        # half of the square of 95% of the target
+        (0.01, 1e6, 0.95 * 0.05 / 2**0.5),
+        # paths have no floor, and take 444 / 4 seconds
+        (0.1, 1.0, 0.95 * 0.05 / 2**0.5),
+        # sqrt(0.2^2 + aim^2) is 0.2 / 0.9
+        (0.1, 1e6, 0.2 * (0.9**-2 - 1) ** 0.5),
+    ],
+    ids=["no floor", "quick paths", "floor"],
+)
+def test_direct_light_is_as_exact_as_is_worth_beside_a_floor(bias, path, aim, monkeypatch):
+    """A pilot asks for strata of this error: bounces make a bias of the first one twice as large."""
+    asked = []
+    monkeypatch.setattr(
+        pilot, "adaptive_cost", lambda _d, _h, aim, _s: asked.append(aim) or DirectCost(1.0, aim)
+    )
+    gather = SimpleNamespace(growth=2.0, bias=bias)
+    paths = PathCosts(seconds={8: path}, noise={8: 1.0}, bias={8: 0.0})
+    costs = Costs(0.0, {"edges": DirectCost(1.0, 0.5)}, gather=gather, paths=paths)
+    settings = SimpleNamespace(method="auto", basis="texel", target_error=0.05, max_seconds=300.0, seed=0)
+    found = pilot._with_adaptive(costs, None, None, settings)
+    assert asked == [pytest.approx(aim, rel=1e-6)]
+    assert set(found.direct) == {"edges", "adaptive"}
