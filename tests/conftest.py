@@ -369,6 +369,6 @@ def artefact(request: pytest.FixtureRequest):
     def save(figure: object, suffix: str = "") -> None:
         ARTEFACTS.mkdir(exist_ok=True)
         name = "".join(c if c.isalnum() else "_" for c in request.node.name).strip("_")
-        figure.savefig(ARTEFACTS / f"{name}{suffix}.png", dpi=90, bbox_inches="tight")
+        figure.savefig(ARTEFACTS / f"{name}{suffix}.png", dpi=60, bbox_inches="tight")
 
     return save

@@ -43,9 +43,9 @@ def gathered_lamps(
     """
     sources = problem.at_vertices
     direct, counts = _direct(problem, run, strata)
-    own = direct if sources is problem else _direct(sources, run, strata)[0]
     indirect, traced = None, 0
     if problem.max_depth != 2:
+        own = direct if sources is problem else _direct(sources, run, strata)[0]
         with run.clock.phase("gather_rays"):
             solver = RadiositySolver(sources, rays, run.seed)
         with run.clock.phase("interreflection"):

@@ -43,17 +43,21 @@ class SpecularOptions:
         what is seen sends on a small share of light, unless as many as ``last``. Where less than 1, some cells stand
         for others.
     last : int
-        At most; cells from which more light arrives have more, until the noise is small enough.
+        At most; cells from which more light arrives have more, until the noise is small enough. If no more than
+        ``first``, that is all there is, and in the texel basis also the strata per axis of a texel, for light that goes
+        straight on and of which a part is lost.
     error : float
         Noise that is small enough: relative L2, of direct and specular light together.
-    strata : int
-        Texel basis: rays per axis of a texel, at first, for light that goes straight on and of which a part is lost.
     """
 
     first: float = 0.5
     last: int = 16
     error: float = 0.0
-    strata: int = 2
+
+    @property
+    def once(self) -> bool:
+        """Whether there is nothing to refine."""
+        return self.first >= self.last
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ class SpecularSearch:
             )
         if problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting):
             passing = PassingLight(problem, every, power, seeds[32:-1])
-            self._parts.append(passing.estimated(options.strata))
+            self._parts.append(passing.estimated(max(1, options.last) if options.once else None))
             self.seen = passing.seen
 
     @property

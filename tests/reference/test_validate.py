@@ -139,7 +139,7 @@ def reference_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ReferenceMatrix, "columns", columns)
 
 
-@pytest.mark.parametrize("basis", ["direction", "texel"])
+@pytest.mark.parametrize("basis", [pytest.param("direction", marks=pytest.mark.slow), "texel"])
 def test_a_good_matrix_passes(scene, basis, tmp_path):
     """Report, figures and files; the measured error is about what the matrix said of itself."""
     transport = precomputed(scene, basis=basis, strata=4)
@@ -221,6 +221,7 @@ LACQUER = {
 MIRROR = {"type": "conductor", "material": "Ag"}
 
 
+@pytest.mark.slow  # each by itself below, mirrors and glass in test_specular.py
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
 def test_rows_of_surfaces_that_are_not_diffuse():
     """Their rows are of vertices that are diffuse, among surfaces as they are: lobes at vertices are no error."""

@@ -45,7 +45,20 @@ def mean(pair: Pair) -> np.ndarray:
     return np.mean(pair, axis=0)
 
 
-@pytest.mark.parametrize("name", SCENES)
+# others compare such shapes, textures and lights with `path` as well
+USUAL = (
+    "shape_obj",
+    "shape_rectangle",
+    "shape_cube",
+    "texture_bitmap_nearest",
+    "texture_checkerboard",
+    "emitter_constant",
+)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in USUAL else name for name in SCENES]
+)
 def test_scenes_agree(name, artefact):
     """Rationale: what a user of Mitsuba gets is one number per pixel; here it is compared for whole scenes.
 

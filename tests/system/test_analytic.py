@@ -222,7 +222,7 @@ def test_known_form_factors(kind, artefact):
 
 
 @pytest.mark.usefixtures("no_held_out")
-@pytest.mark.parametrize("angle", [20, 45, 70])
+@pytest.mark.parametrize("angle", [20, pytest.param(45, marks=pytest.mark.slow), 70])
 def test_a_cap_of_light_over_a_plane(angle, artefact):
     """Rationale: a plane under a cap of radiance 1 and half-angle a about its normal has irradiance pi sin²a.
 
@@ -329,6 +329,7 @@ def test_an_integrating_sphere(artefact):
     artefact(figure)
 
 
+@pytest.mark.slow  # of whole rows: test_three_solvers.py
 def test_reciprocity_with_a_lamp_at_the_vertex(artefact):
     """Rationale: light takes a path in both directions alike (Helmholtz). What a vertex receives from direction w is
     what a lamp at the vertex sends out towards w.

@@ -162,6 +162,7 @@ def test_no_vertex_is_missed(kind, artefact):
     artefact(figure)
 
 
+@pytest.mark.slow  # test_analytic.py
 def test_texel_basis_against_the_cubemap_emitter(grey_scene, artefact):
     """Rationale: in the texel basis an element is the mean over the texel's area, as the `cubemap` emitter lights it.
 

@@ -31,7 +31,7 @@ def test_direct_light_is_that_of_brute_force(scene, gathered):
     assert np.array_equal(gathered.direct.bits, exact.direct.bits)
 
 
-@pytest.mark.parametrize("basis", ["direction", "texel"])
+@pytest.mark.parametrize("basis", ["direction", pytest.param("texel", marks=pytest.mark.slow)])
 def test_errors_are_small_and_the_estimate_knows_them(scene, gathered, basis):
     """Indirect rows of 100 vertices against 2 x 64 paths per element, whose noise two halves take out.
 
@@ -98,6 +98,7 @@ def test_the_report_says_what_was_left_out(gathered):
     assert {"direct", "gather_rays", "interreflection"} <= phases.keys()
 
 
+@pytest.mark.slow  # test_glossy_error.py
 def test_a_target_error_is_met_by_more_rays():
     """A loose target takes the first attempt; a tight one costs more, and the report counts all attempts."""
     scene = build(FINE, **still_life(GREY))

@@ -58,6 +58,7 @@ def _found(scene: Scene, direct: Operator, rays: int, seed: int, averaged: bool)
     return solver.indirect(direct, 0.01).rows(np.arange(scene.n_vertices))
 
 
+@pytest.mark.slow  # of made-up noise: tests/unit/test_surface_smoothing.py; that of a matrix: below
 def test_less_noise_and_as_much_light(scene: Scene, direct: Operator):
     """
     Rationale: neighbours receive nearly the same light, and their rays differ.

@@ -150,6 +150,7 @@ def test_radiance_and_terms(colour):
     check([held_out_error(problem, transport, seed, effort=EFFORT).report() for seed in SEEDS], true)
 
 
+@pytest.mark.slow  # the same estimator: above
 def test_the_error_of_brute_force(coloured):
     """Noise of few paths, which the rows of a point have in common.
 
@@ -163,7 +164,7 @@ def test_the_error_of_brute_force(coloured):
     assert more.report["estimated_error"]["total"] == pytest.approx(true["total"] / 4, rel=0.25)
 
 
-@pytest.mark.parametrize("max_depth", [pytest.param(2, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize("max_depth", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_texels(max_depth):
     """Rationale: in the texel basis a term has the visible share of a texel times the mean of f_k in a disc around it,
     which at 6 x 4 x 4 texels is 4% off, 9% in the second term. The truth has rays in 8 x 8 strata of each texel.
@@ -269,8 +270,15 @@ def test_the_report_has_all_that_a_diffuse_one_has(coloured):
     assert sum(phases.values()) == pytest.approx(report["seconds"]["total"], rel=0.02)
 
 
-@pytest.mark.parametrize("basis", ["direction", "texel"])
-@pytest.mark.parametrize("method", ["auto", "gather"])
+@pytest.mark.parametrize(
+    ("method", "basis"),
+    [
+        ("auto", "direction"),
+        pytest.param("auto", "texel", marks=pytest.mark.slow),
+        ("gather", "direction"),
+        ("gather", "texel"),
+    ],
+)
 def test_a_target_error_is_met_by_more_rays(method, basis):
     """A loose target takes the first attempt; a tight one more rays, and the report counts all attempts.
 

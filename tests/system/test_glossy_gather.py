@@ -168,6 +168,7 @@ def some_of(scene: Scene, name: str, count: int) -> np.ndarray:
     return own.start + np.sort(np.random.default_rng(0).choice(size, min(count, size), replace=False))
 
 
+@pytest.mark.slow  # with several bounces below
 def test_a_glossy_ball_over_a_diffuse_ground(artefact):
     """Rationale: a convex glossy body sends itself no light. With one interreflection its terms are those of light that
     the diffuse ground sends: paths need no more of the ball than f_k, and the scene is that of the user.
@@ -282,7 +283,8 @@ def test_noise_of_rays_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "rays, tolerance", [(64, 0.06), (256, 0.03), pytest.param(1024, 0.06, marks=pytest.mark.slow)]
+    "rays, tolerance",
+    [(64, 0.06), *(pytest.param(*how, marks=pytest.mark.slow) for how in ((256, 0.03), (1024, 0.06)))],
 )
 def test_what_more_rays_can_take_away_is_known(rays: int, tolerance: float) -> None:
     """

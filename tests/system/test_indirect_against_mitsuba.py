@@ -193,7 +193,8 @@ def assert_normal(result: Comparison) -> None:
         assert stats.kstest(result.scaled(factor).row_z, "norm").pvalue < 1e-3
 
 
-@pytest.mark.parametrize("max_depth", [pytest.param(3, marks=pytest.mark.slow), 5])
+@pytest.mark.slow  # in colour below
+@pytest.mark.parametrize("max_depth", [3, 5])
 def test_grey_scene(grey_scene, artefact, max_depth):
     """Rationale: one interreflection and three, in the direction basis, one channel for all.
 
@@ -233,6 +234,7 @@ def test_coloured_scene(coloured_scene, artefact):
     assert max(totals) > 1.2 * min(totals)
 
 
+@pytest.mark.slow  # test_three_solvers.py
 def test_texel_basis(coloured_scene, artefact):
     """Rationale: in the texel basis paths see random directions of the texel; Mitsuba's cubemap emitter too.
 
@@ -312,6 +314,7 @@ def glossy_scene() -> prt.Scene:
     )
 
 
+@pytest.mark.slow  # test_three_solvers.py and test_specular.py
 @pytest.mark.filterwarnings("ignore:.*is not diffuse")
 def test_paths_that_meet_glass_metal_and_mirrors(artefact, monkeypatch):
     """Rationale: paths may meet any BSDF, and light that a mirror or glass focuses is found by no shadow ray.

@@ -96,7 +96,7 @@ def moved_meshes(scene: prt.Scene, offset: np.ndarray, rounded_only: bool) -> di
     return shapes
 
 
-@pytest.mark.parametrize("sizes", [1, 1000])
+@pytest.mark.parametrize("sizes", [pytest.param(1, marks=pytest.mark.slow), 1000])
 def test_place(grey_scene, artefact, sizes):
     """Rationale: a scene far from the origin loses what float32 positions lose there, and nothing more.
 

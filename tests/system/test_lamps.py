@@ -124,7 +124,7 @@ def test_all_lamps_together_are_what_mitsuba_renders(scene, transport):
         assert relative_l2_without_noise(ours[own], x[own], y[own])[0] < 0.05, mesh.name
 
 
-@pytest.mark.parametrize("name", ["panel", "beam"])
+@pytest.mark.parametrize("name", [pytest.param("panel", marks=pytest.mark.slow), "beam"])
 def test_a_column_is_the_scene_with_one_lamp(scene, transport, name):
     """Rationale: ``columns`` are the one-light-at-a-time images that people ask Mitsuba for."""
     lit = "lamp" if name == "panel" else name
@@ -197,6 +197,7 @@ def test_a_picture_of_all_lamps_is_validated(scene, transport, tmp_path):
     assert (tmp_path / "image.png").exists()
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_lamps_are_dimmed_coloured_and_grouped(scene, transport):
     red = transport.relight({"panel": [2, 0, 0], "sky": 0.5})
     panel, sky = (transport.emission.names.index(name) for name in ("panel", "sky"))
@@ -213,6 +214,7 @@ def test_lamps_are_dimmed_coloured_and_grouped(scene, transport):
     )
 
 
+@pytest.mark.slow  # their indirect light: tests/unit/test_unit_lamps.py
 def test_paths_and_finite_elements_agree(scene, lamps, transport):
     paths = prt.precompute(scene, lamps, "brute_force", max_depth=DEPTH, spp=16, progress=False)
     ours, theirs = transport.columns(range(4)), paths.columns(range(4))
@@ -243,6 +245,20 @@ def test_a_picture_at_its_pixels(scene, lamps, artefact):
     dim = ~binary_dilation(x.max(axis=2) > 2, iterations=3)
     assert image[dim].mean() == pytest.approx(x[dim].mean(), rel=0.01)
     assert relative_l2_without_noise(image[dim], x[dim], y[dim])[0] < 0.04
+
+
+def test_direct_light_alone_at_pixels(scene, lamps):
+    """Expected: that of a matrix with indirect light."""
+    pixels = prt.camera_pixels(scene, spp=1)
+    direct, whole = (
+        prt.precompute(scene, lamps, measurement=pixels, max_depth=depth, progress=False)
+        for depth in (2, DEPTH)
+    )
+    assert "indirect" not in direct.operators
+    ids = np.arange(0, len(pixels.points), 37)
+    light = direct.operators["direct"].rows(ids)
+    assert light.any()
+    assert np.array_equal(light, whole.operators["direct"].rows(ids))
 
 
 BALLS = {

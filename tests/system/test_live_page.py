@@ -262,7 +262,7 @@ def test_dropped_images_are_checked_in_python(driver, served, tmp_path):
     assert far(ours, served_image(served, view_of(driver), 24)) < FLIP
 
 
-@pytest.mark.parametrize("served", ["glossy", "lamps"], indirect=True)
+@pytest.mark.parametrize("served", [pytest.param("glossy", marks=pytest.mark.slow), "lamps"], indirect=True)
 def test_colours_that_are_not_known_say_so(driver, served):
     """A matrix that is not compressed, and whose vertices were all sampled alike. Expected: options that say so."""
     for name, words in (

@@ -109,7 +109,13 @@ CASES = {
 
 
 # what these have, others have, too
-LONG = ("rough gold, direct", "interreflection of a spot")
+LONG = (
+    "rough gold, direct",
+    "holes, direct",  # and gold: test_many_lights_compensated.py
+    "rough gold sends light on",
+    "interreflection of a spot",
+    "interreflection of the sky",  # tests/unit/test_unfolding.py
+)
 
 
 @pytest.mark.parametrize(
@@ -201,6 +207,7 @@ def test_a_coat_shows_what_is_before_it() -> None:
     assert noise < 0.004 * np.mean(theirs)
 
 
+@pytest.mark.slow  # of one partition: tests/unit/test_many_lights.py
 def test_the_same_error_is_predicted_and_found() -> None:
     """``report["estimated_error"]`` is the expected error of the picture against all lights.
 

@@ -82,7 +82,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 # What conftest.py does, for the process of a notebook: errors and BRDF factors of less effort than users have; and
-# plans whose costs are measured at fewer vertices, and coarser figures
+# plans whose costs are measured at fewer vertices, and coarser figures, which are not drawn twice to crop them
 LESS_EFFORT = """
 import importlib
 from functools import partial
@@ -99,6 +99,7 @@ harmonics.DirectionGrid = partial(DirectionGrid, 32, 64)
 pilot = importlib.import_module("mi_sparse_prt.planner.pilot")
 pilot.VERTICES, pilot.TEXELS = 32, 4
 importlib.import_module("matplotlib").rcParams["figure.dpi"] = 50
+get_ipython().run_line_magic("config", "InlineBackend.print_figure_kwargs = {'bbox_inches': None}")
 """
 
 

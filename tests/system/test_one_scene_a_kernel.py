@@ -95,7 +95,9 @@ def test_precomputing_rendering_and_validating(kind):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("around", [False, True], ids=["alone", "in aov"])
+@pytest.mark.parametrize(
+    "around", [pytest.param(False, marks=pytest.mark.slow), True], ids=["alone", "in aov"]
+)
 def test_the_integrator(around, tmp_path):
     """Rationale: it looks at its copy of the scene and, for lamps, at the scene; integrators around it do, too."""
     ours = {

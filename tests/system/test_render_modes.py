@@ -131,6 +131,7 @@ def test_half_open_surfaces_keep_their_colour(integrator: dict) -> None:
     assert np.abs(hidden - np.mean(several(by_path, scene, hide_emitters=True), axis=0))[..., 3].max() < 0.01
 
 
+@pytest.mark.slow  # Mitsuba crops; tests/unit/test_fixed_camera.py
 def test_crop_windows(integrator: dict) -> None:
     window = {"crop_width": 10, "crop_height": 6, "crop_offset_x": 8, "crop_offset_y": 9}
     scene = scene_of(view(**window), sky=SKY, panel=PANEL)

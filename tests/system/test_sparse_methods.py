@@ -182,6 +182,7 @@ def test_no_light_is_won_or_lost(method):
     assert np.mean(gains) == pytest.approx(mean, abs=3 * deviation * np.sqrt(1 / 4 + 1 / 8))
 
 
+@pytest.mark.slow  # at fewer directions: test_the_report
 @pytest.mark.usefixtures("no_held_out")
 def test_rates_of_huang2010_are_those_of_figure_9():
     """At the paper's resolution, 6 x 32 x 32, on 3369 vertices.

@@ -116,7 +116,9 @@ def draw(*images: tuple[str, np.ndarray]) -> Figure:
     return figure
 
 
-@pytest.mark.parametrize("kind", EMITTERS)
+@pytest.mark.parametrize(
+    "kind", ["envmap", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("cubemap", "constant"))]
+)
 def test_kinds_of_environments(folder, kind, artefact):
     """Rationale: `mi.render` of an XML scene is the same relit picture that `prt.render` makes.
 

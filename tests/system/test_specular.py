@@ -57,6 +57,7 @@ def objects(albedo: float) -> dict:
     }
 
 
+@pytest.mark.slow  # by paths and by Mitsuba: told_apart and test_mitsuba_renders_the_same_matrix below
 @pytest.mark.usefixtures("no_held_out")
 def test_furnace():
     """Rationale: between white surfaces under even light, radiance is 1 everywhere, whatever mirrors it or lets it by.
@@ -104,7 +105,7 @@ def test_gathered_light_is_that_of_paths():
     ids = np.arange(scene.n_vertices)
     place = np.repeat(ids, 6), np.tile(np.arange(6), len(ids))
     seen = DirectSolver(problem, 4).elements(*place).reshape(-1, 6)
-    arriving = specular_light(problem, 3, SpecularOptions(8, 8, strata=16)).operator.rows(ids).mean(axis=2)
+    arriving = specular_light(problem, 3, SpecularOptions(8, 8)).operator.rows(ids).mean(axis=2)
     bounced = RadiositySolver(problem, 1024).apply(seen + arriving).mean(axis=2)
     paths = PathSolver(replace(problem, specular_apart=False), 512).rows(ids)
     power = lighting.solid_angles
@@ -268,9 +269,12 @@ def test_cells_that_stand_for_others():
 @pytest.mark.slow
 def test_noise_is_averaged_out():
     """
-    Expected: the same rays leave a good part less noise than before, it is as far off as is told, and no light is lost.
+    Expected: the same rays around corners leave a good part less noise than before, it is as far off as is told, and
+    no light is lost.
     """
-    scene = build(0.2, **objects(0.6))
+    every_object = objects(0.6)
+    bending = {name: every_object[name] for name in ("floor", "wall", "mirror", "glass")}
+    scene = build(0.2, **bending)
     problem = replace(problem_at(scene, prt.CubemapLighting(4), basis="texel"), specular_apart=True)
     every, power = np.arange(scene.n_vertices), problem.reflection.albedo[:, None].astype(np.float64)
     area = np.zeros(scene.n_vertices)
@@ -556,6 +560,7 @@ def test_mitsuba_renders_the_same_matrix():
         prt.validate(scene, replace(transport, basis="direction"), progress=False)
 
 
+@pytest.mark.slow  # any elements drawn by energy: tests/unit/test_lamp_rays.py
 def test_few_rows_stand_for_all():
     """
     Expected: of specular light, rows that are drawn where it is have its energy, and that of light spread evenly, on

@@ -65,7 +65,7 @@ def test_blocks_do_not_show(monkeypatch):
     """Expected: the same bits, whether all points are looked at together or a few at a time."""
     problem = glossy_problem()
     whole = term_rows(problem, 3)
-    monkeypatch.setattr(specular_terms, "LANES", 8 * 4000)
+    monkeypatch.setattr(specular_terms, "LANES", 8 * 20_000)
     parts = term_rows(problem, 3)
     assert parts.rays == whole.rays
     for a, b in zip(whole.matrices, parts.matrices, strict=True):

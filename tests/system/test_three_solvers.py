@@ -84,7 +84,13 @@ def draw(ours: Estimate, theirs: Estimate) -> Figure:
 
 
 @pytest.mark.parametrize(
-    ("max_depth", "basis"), [(3, "direction"), (5, "direction"), (-1, "direction"), (4, "texel")]
+    ("max_depth", "basis"),
+    [
+        pytest.param(3, "direction", marks=pytest.mark.slow),
+        (5, "direction"),
+        (-1, "direction"),
+        (4, "texel"),
+    ],
 )
 def test_adjoint_rows_are_path_traced_elements(coloured_scene, artefact, max_depth, basis):
     """Rationale: one interreflection, three, any number; both bases; coloured surfaces.

@@ -69,7 +69,9 @@ def test_few_rays_where_little_is_seen_in_part(first):
     assert rays.sum() < 6**2 * x.size / 4
 
 
-@pytest.mark.parametrize(("gap", "across"), [(0.5, 4), (0.5, 8), (0.2, 6)])
+@pytest.mark.parametrize(
+    ("gap", "across"), [pytest.param(0.5, 4, marks=pytest.mark.slow), (0.5, 8), (0.2, 6)]
+)
 def test_as_exact_as_strata_everywhere(gap, across):
     """
     Scenario: slats and gaps of 0.3, under which texels at the zenith are cut once or twice.
@@ -86,7 +88,7 @@ def test_as_exact_as_strata_everywhere(gap, across):
     assert ours.sum() == pytest.approx((x + y).sum() / 2, rel=0.01)
 
 
-@pytest.mark.parametrize("first", [1, 2])
+@pytest.mark.parametrize("first", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_light_through_narrow_gaps_is_not_lost(first):
     """
     Scenario: gaps of 1% of the slats: a texel and those around it have one of 36 rays in a gap, or none.

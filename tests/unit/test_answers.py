@@ -5,7 +5,7 @@ import threading
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import T, build, diffuse, still_life
+from conftest import T, build, diffuse, still_life, without_held_out
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mi_sparse_prt as prt
@@ -57,13 +57,15 @@ def scene():
 
 @pytest.fixture(scope="module")
 def glossy(scene):
-    transport = prt.precompute(scene, LIGHTING, terms=4, method="gather", max_depth=3, progress=False)
+    with without_held_out():
+        transport = prt.precompute(scene, LIGHTING, terms=4, method="gather", max_depth=3, progress=False)
     return transport, make_live_page(scene, transport, LIGHTS)
 
 
 @pytest.fixture(scope="module")
 def lamps(scene):
-    transport = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=3, progress=False)
+    with without_held_out():
+        transport = prt.precompute(scene, prt.SceneEmitters(scene), max_depth=3, progress=False)
     return transport, make_live_page(scene, transport, {})
 
 

@@ -235,7 +235,9 @@ def test_constant_emitter_and_plain_values():
 SUNS = [(0.3, 0.5, 0.8), (-0.866, -0.43, 0.254), (-0.901, 0.276, 0.335), (-0.871, -0.082, 0.485)]
 
 
-@pytest.mark.parametrize("direction", SUNS)
+@pytest.mark.parametrize(
+    "direction", [*SUNS[:2], *(pytest.param(direction, marks=pytest.mark.slow) for direction in SUNS[2:])]
+)
 @pytest.mark.parametrize("kind", ["sunsky", pytest.param("sun", marks=pytest.mark.slow)])
 def test_a_sun_smaller_than_samples_keeps_its_energy(kind, direction):
     """Its sun is half a degree wide and most of its light. Truth: Mitsuba's own samples of it."""

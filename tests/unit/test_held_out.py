@@ -115,9 +115,10 @@ def flipped(transport: LightTransport, one_of: int, seed: int) -> LightTransport
 # ------------------------------------------------------------------------------------ reports
 
 
+@pytest.mark.slow  # of few elements: test_intervals_from_few_elements
 @pytest.mark.parametrize(
     ("basis", "coarse"),
-    [("direction", None), pytest.param("texel", 2, marks=pytest.mark.slow)],
+    [("direction", None), ("texel", 2)],
     ids=["direction", "texel, coarse indirect"],
 )
 def test_the_estimate_covers_the_true_error(grey_scene, basis, coarse):
@@ -207,7 +208,7 @@ FEW = Effort(fewest_rays=1500, paths=150, few_paths=150, spp=128)  # for a mesh
 SOME = Effort(fewest_rays=16_000)
 
 
-@pytest.mark.parametrize("where", ["anywhere", "one vertex"])
+@pytest.mark.parametrize("where", [pytest.param("anywhere", marks=pytest.mark.slow), "one vertex"])
 def test_rare_wrong_bits(exact, where):
     """1 of 2000 visible bits is wrong; or all of one vertex in each mesh. A tenth of the elements is looked at.
 
@@ -496,7 +497,7 @@ def corner() -> prt.Scene:
     )
 
 
-@pytest.mark.parametrize("where", ["still life", "corner"])
+@pytest.mark.parametrize("where", ["still life", pytest.param("corner", marks=pytest.mark.slow)])
 def test_the_estimate_for_sparse_is_within_a_fifth(grey_scene, where):
     """Two seeds of ``method="sparse"`` with indirect light; the truth is a converged matrix.
 

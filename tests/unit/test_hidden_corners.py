@@ -154,6 +154,7 @@ def test_no_light_leaks(name, direct, basis):
     assert light[:, behind].sum(axis=1).max() < 0.03 * light[:, ~behind].sum(axis=1).max()
 
 
+@pytest.mark.slow  # test_no_light_leaks
 def test_errors_at_a_contact_shrink(monkeypatch):
     """
     Expected: around the foot of a ball, indirect rows are nearer to paths' than with all corners, by a quarter (what

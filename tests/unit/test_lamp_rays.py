@@ -33,7 +33,7 @@ def under_a_lamp(gap: float) -> Problem:
     return Problem(scene, lamps, mesh_vertices(scene), Diffuse(scene.albedo), "texel", 4)
 
 
-@pytest.mark.parametrize("gap", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("gap", [0.001, pytest.param(0.01, marks=pytest.mark.slow), 0.1])
 def test_lamps_next_to_a_surface_light_it_without_much_noise(gap):
     """Rationale: samples of a lamp see the place above a point seldom, which then counts without bounds.
 

@@ -68,6 +68,7 @@ def test_paths_that_meet_a_lamp_and_paths_that_ask_it_agree(problem, monkeypatch
     )  # a point is only asked
 
 
+@pytest.mark.slow  # their mean: tests/unit/test_unit_lamps.py; how many there are: below
 def test_more_paths_where_they_spread(problem):
     """Rationale: what more paths are given to depends on others, so that the mean of the result does not.
 

@@ -295,6 +295,7 @@ def estimates_with_error(matrix: Elements, whole: np.ndarray, sets: int) -> Iter
         yield sum_with_error(twin, partition, sets, np.random.default_rng(k))
 
 
+@pytest.mark.slow  # more exactly than above
 def test_the_predicted_error_has_no_bias(monkeypatch) -> None:
     """Of a random matrix, at half of its pixels: the mean of 4000 predictions is what all choices give.
 

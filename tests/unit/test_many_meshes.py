@@ -73,6 +73,7 @@ def test_a_pilot_looks_at_a_few_hundred_vertices(scene):
     assert held.stand_for.sum() == pytest.approx(scene.n_vertices)
 
 
+@pytest.mark.slow  # that of few: test_held_out.py; that of each by itself: below
 def test_the_error_of_many_meshes(scene):
     """Rationale: elements of all meshes are evaluated together, and told apart again.
 
@@ -147,6 +148,7 @@ def test_order_of_many_shapes():
     assert np.array_equal(*rows)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_meshes_of_one_material_are_traced_as_one(monkeypatch):
     """
     Rationale: every shape makes every kernel slower to trace.

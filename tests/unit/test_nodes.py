@@ -134,6 +134,7 @@ def test_fewer_nodes_fewer_rays_and_nearly_the_same_light(scene):
     assert found.mean() == pytest.approx(known.mean(), rel=0.01)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_glossy_vertices_have_terms_of_their_own(monkeypatch):
     """
     Rationale: unit-albedo light is interpolated between nodes, the terms of a BRDF in frames that turn are not.

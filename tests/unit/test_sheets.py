@@ -144,6 +144,7 @@ def test_a_lamp_lights_a_closed_room(lamp):
     assert scene.hash != build(0.5, **walls(6, twosided(RED)), lamp=lamps[None]).hash or lamp is None
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_a_room_with_a_lamp_is_not_black():
     """Expected: ``sparse_prt`` shows a closed two-sided room lit by a point as ``path`` does (mean within 2%)."""
     camera = {
@@ -156,7 +157,7 @@ def test_a_room_with_a_lamp_is_not_black():
     scene = mi.load_dict({"type": "scene", **shapes, "camera": camera})
     ours, known = (
         np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": 5, **more}), spp=256))
-        for kind, more in (("sparse_prt", {"progress": False}), ("path", {}))
+        for kind, more in (("sparse_prt", {"progress": False, "edge_length": 0.08}), ("path", {}))
     )
     assert known.mean() > 0.1
     assert ours.mean() == pytest.approx(known.mean(), rel=0.02)
@@ -212,6 +213,7 @@ def test_light_is_gathered_from_the_sheet_that_rays_meet():
     assert below.shape == (3,)
 
 
+@pytest.mark.usefixtures("no_held_out")
 def test_the_camera_sees_backs():
     """Expected: turning a rectangle round, with its two colours, changes nothing; nor does it for a rough conductor."""
     lighting = prt.CubemapLighting(4)

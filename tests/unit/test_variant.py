@@ -179,7 +179,9 @@ def test_an_llvm_that_aborts_is_refused_before_it_can():
     assert "export DRJIT_LIBLLVM_PATH" in last or "apt-get install libllvm19" in last
 
 
-@pytest.mark.parametrize("other", ["scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize(
+    "other", ["scalar_rgb", pytest.param("llvm_ad_mono", marks=pytest.mark.slow), "llvm_ad_spectral"]
+)
 def test_variants_that_are_set_later_are_refused_by_name(other, tmp_path):
     """A file is not loaded there, and the integrator says where it works instead of not being found."""
     scene = tmp_path / "scene.xml"
