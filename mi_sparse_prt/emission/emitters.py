@@ -51,7 +51,7 @@ class SceneEmitters:
         known = emitter_names(scene)
         if not known:
             raise PrtError(
-                f"the scene {scene.path or ''} has no emitters: add an area light, a point, a spot ..."
+                f"the scene {scene.path or 'in memory'} has no emitters: add an area light, a point, a spot ..."
             )
         chosen = {name: [name] for name in known} if groups is None else dict(groups)
         for group, members in chosen.items():

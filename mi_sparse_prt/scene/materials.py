@@ -35,6 +35,11 @@ _LAMP = Fact(
     " are area emitters: matrices of lamps (SceneEmitters) have their light, those of a cubemap do not",
     LampWarning,
 )
+_OTHER_LAMP = Fact(
+    " shines, but not as an area emitter: it is left out (no path from a camera finds the light of directionalarea)",
+    " shine, but not as area emitters: they are left out (no path from a camera finds the light of directionalarea)",
+    LampWarning,
+)
 _MEDIUM = Fact(
     " bounds a medium: media are left out, light passes as through a vacuum (volpath renders them)",
     " bound media: these are left out, light passes as through a vacuum (volpath renders them)",
@@ -110,7 +115,7 @@ class Material:
         if not self.diffuse:
             notes.add(name, _not_diffuse(self.bsdf, self._lambertian))
         if self._emitter is not None:
-            notes.add(name, _LAMP)
+            notes.add(name, _OTHER_LAMP if self._radiance is None else _LAMP)
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             notes.add(name, _MEDIUM)
 

@@ -13,6 +13,7 @@ import pytest
 
 import mi_sparse_prt  # noqa: F401  chooses the variant
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
+from mi_sparse_prt.emission.emitters import SceneEmitters
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.scene import surfaces
 from mi_sparse_prt.scene.loading import load_scene
@@ -227,6 +228,17 @@ def test_area_emitters_are_copied_to_the_world_scene_only() -> None:
     si = corner_interactions(scene)[0]
     si.wi = mi.Vector3f(0, 0, 1)
     np.testing.assert_allclose(np.ravel(copy.eval(si))[:3], [1, 2, 3], rtol=1e-6)
+
+
+def test_lamps_that_no_path_finds_are_named() -> None:
+    lamp = {"type": "rectangle", "emitter": {"type": "directionalarea"}}
+    original = mi.load_dict({"type": "scene", "lamp": lamp, "floor": {"type": "rectangle"}})
+    with pytest.warns(PrtWarning, match="'lamp' shines, but not as an area emitter: it is left out"):
+        scene = Scene.from_mitsuba(original, INF)
+    assert len(scene.warnings) == 1
+    assert scene.mitsuba.emitters() == []
+    with pytest.raises(PrtError, match="the scene in memory has no emitters"):
+        SceneEmitters(scene)
 
 
 # -------------------------------------------------------------------------------------------- edge length
