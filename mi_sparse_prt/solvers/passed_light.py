@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import Bits
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.refined_mean import Doubles, Estimate, RefinedMean, Round, compared
 from mi_sparse_prt.solvers.specular_chains import LANES, Sparse
 
+Floats = NDArray[np.float32]
+
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel
-FIRST = 2  # strata per axis: with one, noise is seven times as large for a quarter of the rays
+FIRST = 2  # strata per axis at edges: with one, noise is seven times as large for a quarter of the rays
+ALIKE = (
+    0.1  # of what a surface lets through, that texels beside each other may differ by where there is no edge
+)
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 
@@ -40,14 +47,17 @@ class PassingLight:
 
         Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
         least where strata are in proportion to the fifth root of each texel's own, which two first halves tell,
-        averaged with those of its neighbours.
+        averaged with those of its neighbours. Their strata are few where centres of texels tell of no edge.
         """
         if self._problem.basis == "direction":
-            return RefinedMean(compared([[self._found] * 3] * 2, self._power, self._rays))
-        first, squares = self._sampled(np.full(len(self._rows), across or FIRST))
+            return RefinedMean(compared([[self._found]] * 2, self._power, self._rays))
+        strata = np.full(len(self._rows), across or FIRST)
+        if across is None and self.seen is not None:
+            strata[self._without_edges()] = 1
+        first, squares = self._sampled(strata)
         if across is not None or not len(squares):
             return RefinedMean(first)
-        law = self._averaged(squares) * FIRST**3
+        law = self._averaged(squares * strata**3.0)
         between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
 
         def sample(wanted: float) -> Round:
@@ -60,11 +70,25 @@ class PassingLight:
 
     def _averaged(self, squares: Doubles) -> Doubles:
         """Squared noise of each element, averaged with its neighbours on the cubemap and one average element."""
-        shape = len(self._ids), self._problem.emission.size
-        noise = scipy.sparse.coo_array((squares, (self._rows, self._texels)), shape=shape).tocsr()
-        beside = _beside(self._problem)
-        total = scipy.sparse.csr_array(noise @ beside)[self._rows, self._texels]
-        return (np.asarray(total).ravel() + squares.mean()) / (np.diff(beside.indptr)[self._texels] + 1)
+        beside = self._problem.emission.sides.tables.beside
+        sums = np.empty(len(squares))
+        run_in_parts(_sum_beside, len(self._ids), self._starts(), self._texels, squares, beside, sums)
+        return (sums + squares.mean()) / (beside.shape[1] + 2)
+
+    def _without_edges(self) -> NDArray[np.bool_]:
+        """Whether as much light passes as many surfaces as in the texels beside it, as far as centres tell."""
+        lighting = self._problem.emission
+        powers = lighting.solid_angles / np.float32(np.pi)
+        where = self._problem.points.normals[self._ids], lighting.directions, powers
+        found = self._found.indptr, self._found.indices, self._found.data
+        alike = np.empty(len(self._rows), bool)
+        beside = lighting.sides.tables.beside
+        run_in_parts(_are_alike, len(self._ids), self._starts(), self._texels, found, where, beside, alike)
+        return alike
+
+    def _starts(self) -> NDArray[np.int64]:
+        """Where elements of each point begin."""
+        return np.searchsorted(self._rows, np.arange(len(self._ids) + 1))
 
     def _sampled(self, strata: NDArray[np.int64]) -> tuple[Estimate, Doubles]:
         """Light through strata of each texel, twice; and the squared noise of each element."""
@@ -80,7 +104,7 @@ class PassingLight:
                 half[which[passed.elements]] = passed.values
         every = np.arange(len(strata))
         halves = [
-            [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] * 3 for half in values
+            [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] for half in values
         ]
         traced, self._rays = self._rays + 2 * int((strata**2).sum()), 0
         spread = np.square(values[0] - values[1], dtype=np.float64).sum(axis=1) / 4
@@ -153,3 +177,58 @@ def _stacked(blocks: list[Sparse], direct: DirectSolver) -> Sparse:
     """Of no block, too."""
     none = (0, direct.lighting.size * max(direct.problem.depths_apart, 1))
     return scipy.sparse.vstack([scipy.sparse.csr_array(none, dtype=np.float32), *blocks], format="csr")
+
+
+@numba.njit(nogil=True, cache=True)
+def _sum_beside(
+    first: int,
+    last: int,
+    starts: NDArray[np.int64],
+    texels: NDArray[np.int64],
+    values: Doubles,
+    beside: NDArray[np.int32],
+    sums: Doubles,
+) -> None:
+    """Values of elements, row i's from starts[i] on, and of those beside them on the cubemap, if they are listed."""
+    row = np.zeros(len(beside))
+    for i in range(first, last):
+        own = range(starts[i], starts[i + 1])
+        for k in own:
+            row[texels[k]] = values[k]
+        for k in own:
+            sums[k] = row[texels[k]]
+            for texel in beside[texels[k]]:
+                sums[k] += row[texel]
+        for k in own:
+            row[texels[k]] = 0
+
+
+@numba.njit(nogil=True, cache=True)
+def _are_alike(
+    first: int,
+    last: int,
+    starts: NDArray[np.int64],
+    texels: NDArray[np.int64],
+    found: tuple[NDArray[np.int32], NDArray[np.int32], Floats],
+    where: tuple[Floats, Floats, Floats],
+    beside: NDArray[np.int32],
+    alike: NDArray[np.bool_],
+) -> None:
+    """Which elements let as much light pass as those beside them above the horizon, by as many surfaces."""
+    (begins, columns, values), (normals, directions, powers) = found, where
+    size = len(beside)
+    shares, met = np.zeros(size), np.zeros(size, np.int64)
+    for i in range(first, last):
+        own = range(begins[i], begins[i + 1])
+        for k in own:
+            texel = columns[k] % size
+            cosine = np.dot(normals[i], directions[texel])
+            shares[texel], met[texel] = values[k] / (cosine * powers[texel]), columns[k] // size
+        for k in range(starts[i], starts[i + 1]):
+            share, same = shares[texels[k]], shares[texels[k]] > 0
+            for texel in beside[texels[k]]:
+                if np.dot(normals[i], directions[texel]) > 0:
+                    same &= met[texel] == met[texels[k]] and abs(shares[texel] - share) <= ALIKE * share
+            alike[k] = same
+        for k in own:
+            shares[columns[k] % size] = 0

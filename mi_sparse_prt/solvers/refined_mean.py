@@ -38,7 +38,7 @@ class Limit(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Two halves, each of three channels; the squared norm of radiance, the squared noise of the mean, and rays."""
+    """Two halves, of one channel for all or of three; squared norm of radiance, squared noise of the mean, and rays."""
 
     halves: list[list[Sparse]]
     square: float
@@ -91,8 +91,7 @@ class RefinedMean:
         self.total, self.noise = total, total.noise
         if self._averaging is not None and self._power is not None and total.noise > 0:
             halves = _distinct(total.halves)
-            power = self._power if len(halves[0]) > 1 else self._power.sum(axis=1, keepdims=True)
-            self.noise = min(max(self._averaging.judge(halves, power), 0), total.noise)
+            self.noise = min(max(self._averaging.judge(halves, _of(halves, self._power)), 0), total.noise)
 
     def refine(self, limit: Limit) -> None:
         """Add estimates until the noise is small enough."""
@@ -110,7 +109,7 @@ class RefinedMean:
                 self._sample = None
 
     def mean(self) -> list[Sparse]:
-        """Light of all channels, of both halves together."""
+        """Light of both halves together, of as many channels as these have."""
         first, second = _distinct(self.total.halves)
         mean = [(a + b) * np.float32(0.5) for a, b in zip(first, second, strict=True)]
         if self._averaging is not None and self.total.noise > 0:
@@ -135,9 +134,14 @@ def _mean_of(a: Estimate, b: Estimate, share: float) -> Estimate:
     return Estimate(halves, square, noise, a.rays + b.rays)
 
 
+def _of(halves: list[list[Sparse]], power: Doubles) -> Doubles:
+    """What the squares of each row count in each channel that halves have."""
+    return power if len(halves[0]) > 1 else power.sum(axis=1, keepdims=True)
+
+
 def compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> Estimate:
     """With the squared norm of radiance, and of the noise in the mean of the two halves."""
-    square, noise = 0.0, 0.0
+    square, noise, power = 0.0, 0.0, _of(halves, power)
     for c, (a, b) in enumerate(zip(*halves, strict=True)):
         square += float(power[:, c] @ (a.multiply(b)).sum(axis=1))
         noise += float(power[:, c] @ ((a - b).power(2)).sum(axis=1)) / 4

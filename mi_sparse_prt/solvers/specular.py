@@ -186,6 +186,8 @@ class SpecularSearch:
     def light(self) -> SpecularLight:
         """What was found so far."""
         means = [part.mean() for part in self._parts]
+        channels = max(map(len, means))
+        means = [mean * (channels // len(mean)) for mean in means]
         mean = [sum(matrices[1:], matrices[0]) for matrices in zip(*means, strict=True)]
         grey = all((mean[0] != other).nnz == 0 for other in mean[1:])
         matrices = tuple(scipy.sparse.csr_array(m) for m in (mean[:1] if grey else mean))

@@ -1,0 +1,115 @@
+"""Light that goes straight through surfaces: noise of neighbouring elements together, and few rays without edges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import T, build, diffuse, problem_at
+from numpy.testing import assert_allclose
+
+import mi_sparse_prt as prt
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
+from mi_sparse_prt.solvers.passed_light import PassingLight, _sum_beside
+from mi_sparse_prt.solvers.refined_mean import Limit
+
+
+def test_values_are_added_to_those_of_texels_beside():
+    """Expected: what a loop over rows of all texels adds up, where some elements are not listed; rows may be empty."""
+    rng, lighting = np.random.default_rng(3), prt.CubemapLighting(4)
+    beside, size = lighting.sides.tables.beside, lighting.n_directions
+    listed = rng.random((7, size)) < 0.4
+    listed[2] = False
+    rows, texels = np.nonzero(listed)
+    values = rng.random(len(rows))
+    every = np.zeros((7, size))
+    every[rows, texels] = values
+    expected = np.array(
+        [every[i, j] + sum(every[i, k] for k in beside[j]) for i, j in zip(rows, texels, strict=True)]
+    )
+    sums = np.empty(len(rows))
+    starts = np.searchsorted(rows, np.arange(8))
+    for first, last in ((0, 3), (3, 7)):
+        _sum_beside(first, last, starts, texels, values, beside, sums)
+    assert_allclose(sums, expected, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """A floor under a half-open sheet and a pane; some of its points."""
+    shapes = {
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90),
+            "bsdf": diffuse(0.5, 0.5, 0.5),
+        },
+        "sheet": {
+            "type": "rectangle",
+            "to_world": T().translate([-0.6, 0.7, 0]).rotate([1, 0, 0], 70).scale(0.6),
+            "bsdf": {
+                "type": "mask",
+                "opacity": 0.4,
+                "bsdf": {"type": "twosided", "bsdf": diffuse(0.5, 0.5, 0.5)},
+            },
+        },
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([0.7, 0.8, 0]).rotate([0, 1, 0], 60).scale(0.5),
+            "bsdf": {"type": "thindielectric"},
+        },
+    }
+    scene = build(0.4, **shapes)
+    return replace(problem_at(scene, prt.CubemapLighting(16), basis="texel"), specular_apart=True)
+
+
+IDS = np.arange(0, 24, 2)  # of the floor
+
+
+def search(problem, seed):
+    seeds = np.random.default_rng(seed).integers(1 << 31, size=95).tolist()
+    return PassingLight(problem, IDS, np.ones((len(IDS), 3)), seeds)
+
+
+def test_elements_without_edges(problem):
+    """Expected: those that let as much pass as all texels beside them above the horizon, by as many surfaces."""
+    light = search(problem, 1)
+    lighting, depths = problem.emission, problem.depths_apart
+    cosine = problem.points.normals[IDS] @ lighting.directions.T
+    power = np.where(cosine > 0, cosine * lighting.solid_angles / np.pi, np.inf)
+    by_depth = light._found.toarray().reshape(len(IDS), depths, -1) / power[:, None]
+    share, met = by_depth.sum(axis=1), by_depth.argmax(axis=1)
+    expected = [
+        share[i, j] > 0
+        and all(
+            cosine[i, k] <= 0
+            or (met[i, k] == met[i, j] and abs(share[i, k] - share[i, j]) <= 0.1 * share[i, j])
+            for k in lighting.sides.tables.beside[j]
+        )
+        for i, j in zip(light._rows, light._texels, strict=True)
+    ]
+    assert np.array_equal(light._without_edges(), expected)
+    assert 0.1 < np.mean(expected) < 0.9
+
+
+def test_few_rays_without_edges_take_nothing_away(problem):
+    """Expected: light is that of 256 rays in each texel, within its noise, which is as large as is told."""
+    n = problem.emission.n_directions
+    fine = DirectSolver(problem, 16).partly_passed(np.repeat(IDS, n), np.tile(np.arange(n), len(IDS)))
+    exact = np.zeros(len(IDS) * n)
+    exact[fine.elements] = fine.values.sum(axis=1)
+    sums, errors, told = [], [], []
+    for seed in range(8):
+        light = search(problem, seed).estimated()
+        if seed % 2:
+            light.refine(Limit(1e-3, 0.0, 0.0))
+        (mean,) = light.mean()
+        found = mean.toarray().reshape(len(IDS), -1, n).sum(axis=1).ravel()
+        sums.append(found.sum() / exact.sum())
+        errors.append(3 * np.square(found - exact).sum())
+        told.append(light.noise)
+    spread = np.std(sums, ddof=1) / np.sqrt(len(sums))
+    print(f"{np.mean(sums):.4f} +- {spread:.4f}; told {told}, true {errors}")
+    assert spread < 0.004
+    assert np.mean(sums) == pytest.approx(1, abs=4 * spread + 0.001)
+    for half in (slice(0, None, 2), slice(1, None, 2)):
+        assert np.sqrt(np.mean(told[half])) == pytest.approx(np.sqrt(np.mean(errors[half])), rel=0.15)
+    assert np.mean(told[1::2]) < 0.5 * np.mean(told[::2])
