@@ -21,9 +21,7 @@ Floats = NDArray[np.float32]
 
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel
 FIRST = 2  # strata per axis at edges: with one, noise is seven times as large for a quarter of the rays
-ALIKE = (
-    0.1  # of what a surface lets through, that texels beside each other may differ by where there is no edge
-)
+ALIKE = 0.1  # as a share: what neighbouring texels let through may differ by so much without an edge
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 
@@ -47,7 +45,7 @@ class PassingLight:
 
         Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
         least where strata are in proportion to the fifth root of each texel's own, which two first halves tell,
-        averaged with those of its neighbours. Their strata are few where centres of texels tell of no edge.
+        averaged with those of its neighbours. These begin with one ray where centres of texels tell of no edge.
         """
         if self._problem.basis == "direction":
             return RefinedMean(compared([[self._found]] * 2, self._power, self._rays))

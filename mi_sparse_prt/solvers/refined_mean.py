@@ -91,7 +91,9 @@ class RefinedMean:
         self.total, self.noise = total, total.noise
         if self._averaging is not None and self._power is not None and total.noise > 0:
             halves = _distinct(total.halves)
-            self.noise = min(max(self._averaging.judge(halves, _of(halves, self._power)), 0), total.noise)
+            self.noise = min(
+                max(self._averaging.judge(halves, _power_of(halves, self._power)), 0), total.noise
+            )
 
     def refine(self, limit: Limit) -> None:
         """Add estimates until the noise is small enough."""
@@ -134,14 +136,14 @@ def _mean_of(a: Estimate, b: Estimate, share: float) -> Estimate:
     return Estimate(halves, square, noise, a.rays + b.rays)
 
 
-def _of(halves: list[list[Sparse]], power: Doubles) -> Doubles:
+def _power_of(halves: list[list[Sparse]], power: Doubles) -> Doubles:
     """What the squares of each row count in each channel that halves have."""
     return power if len(halves[0]) > 1 else power.sum(axis=1, keepdims=True)
 
 
 def compared(halves: list[list[Sparse]], power: Doubles, rays: int) -> Estimate:
     """With the squared norm of radiance, and of the noise in the mean of the two halves."""
-    square, noise, power = 0.0, 0.0, _of(halves, power)
+    square, noise, power = 0.0, 0.0, _power_of(halves, power)
     for c, (a, b) in enumerate(zip(*halves, strict=True)):
         square += float(power[:, c] @ (a.multiply(b)).sum(axis=1))
         noise += float(power[:, c] @ ((a - b).power(2)).sum(axis=1)) / 4
