@@ -18,6 +18,7 @@ from mi_sparse_prt.manylights.particles import next_2d
 from mi_sparse_prt.manylights.surfaces import BENT, Surfaces, diffuse_value
 from mi_sparse_prt.measurement.pixels import jittered_places
 from mi_sparse_prt.scene.instances import placed_shapes
+from mi_sparse_prt.scene.materials import single_direction
 
 LONGEST = 64  # surfaces that a ray meets, where ``max_depth`` sets no limit
 _CAMERA, _COATS = 0x5A17, 0x5A18  # keys of random numbers
@@ -354,8 +355,6 @@ def _specular(
     bent = (flags & BENT) != 0
     smooth, null = mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.has_flag(flags, mi.BSDFFlags.Null)
     u, choice = rng.next_float32(), rng.next_float32()
-    whole, single = mi.BSDFContext(), mi.BSDFContext()
-    single.type_mask = BENT
 
     # holes, beside what is around them
     passed = mi.Color3f(bsdf.eval_null_transmission(si, active & smooth & null))
@@ -366,13 +365,14 @@ def _specular(
 
     # a coat, or something else that reflects into single directions, beside what spreads light
     mixed = active & smooth & bent & ~hole
-    _, guess = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), mixed & ~null)
+    _, guess = single_direction(si, rng.next_float32(), next_2d(rng), mixed & ~null, BENT)
     p_bent = dr.select(null, 0.5, dr.clip(dr.max(mi.Color3f(guess)), 0.02, 0.98))
     p_bent = dr.select(by_coats, dr.select(before, 1, p_bent), 0)
     follows = mixed & (choice < p_bent)
-    some, its = bsdf.sample(single, si, rng.next_float32(), next_2d(rng), follows & ~null)
+    some, its = single_direction(si, rng.next_float32(), next_2d(rng), follows & ~null, BENT)
     only = active & ~smooth
-    other, share = bsdf.sample(whole, si, rng.next_float32(), next_2d(rng), only | (follows & null))
+    lit = only | (follows & null)
+    other, share = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), lit)
     is_bent = (mi.UInt32(other.sampled_type) & BENT) != 0
     its = dr.select(null, dr.select(is_bent, share, 0), its)
     factor = dr.select(follows, factor * its / p_bent, factor)

@@ -16,6 +16,7 @@ import mitsuba as mi
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
+from mi_sparse_prt.scene.materials import single_direction
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.traced_scene import TracedScene
 
@@ -143,11 +144,9 @@ def _scattered(
 ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
     """A direction that rays go on in, and what it weighs: 0 where there is none."""
     bsdf, u, v = si.bsdf(), sampler.next_1d(active), mi.Point2f(sampler.next_2d(active))
-    single = mi.BSDFContext()
-    single.type_mask = int(mi.BSDFFlags.Delta)  # Null is among them
-    alone = active & ~whole & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-    sample, weight = bsdf.sample(single, si, u, v, alone)
-    weight = dr.select(alone, weight, 0)
+    delta = int(mi.BSDFFlags.Delta)  # Null is among them
+    alone = active & ~whole & mi.has_flag(bsdf.flags(), delta)
+    sample, weight = single_direction(si, u, v, alone, delta)
     if not (whole.state == dr.VarState.Literal and dr.none(whole)):
         every, its = bsdf.sample(mi.BSDFContext(), si, u, v, active & whole)
         sample, weight = dr.select(whole, every, sample), dr.select(active & whole, its, weight)

@@ -70,6 +70,28 @@ def is_one_of(bsdfs: Sequence[mi.BSDF], si: mi.SurfaceInteraction3f) -> mi.Mask:
     return result
 
 
+def single_direction(
+    si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Mask, kinds: int
+) -> tuple[mi.BSDFSample3f, mi.Color3f]:
+    """A direction that surfaces scatter into as mirrors, glass or holes do, and its weight: 0 where there is none.
+
+    Parameters
+    ----------
+    si : SurfaceInteraction3f
+    u, v : Float, Point2f
+        Random numbers; samplers of Mitsuba's return 1 now and then.
+    active : Mask
+    kinds : int
+        Flags of ``mi.BSDFFlags``.
+    """
+    single = mi.BSDFContext()
+    single.type_mask = kinds
+    sample, weight = si.bsdf().sample(single, si, u, v, active)
+    # for numbers that are, or are rounded to, 1, BSDFs choose the last of their kinds even if it is not asked for
+    found = active & ((mi.UInt32(sample.sampled_type) & kinds) != 0)
+    return sample, dr.select(found, weight, 0)
+
+
 def bends_normals(bsdf: mi.BSDF) -> bool:
     """Whether a bump or normal map turns its shading normals; its flags do not tell."""
     return bool(_classes(printed(bsdf)) & BUMPED)

@@ -27,7 +27,7 @@ from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.operators.operator import Ids
-from mi_sparse_prt.scene.materials import is_one_of
+from mi_sparse_prt.scene.materials import is_one_of, single_direction
 from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.lamps import lamp_asked, lamp_met
 from mi_sparse_prt.solvers.problem import Problem
@@ -452,12 +452,11 @@ class SpecularChains:
     ) -> tuple[mi.BSDFSample3f, mi.Color3f]:
         """Where rays go on, and what that weighs: single directions, but all that rough glass scatters."""
         u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        single = mi.BSDFContext()
-        single.type_mask = int(mi.BSDFFlags.Delta)
+        delta = int(mi.BSDFFlags.Delta)
         if not self._rough_glass:
-            return si.bsdf().sample(single, si, u, v, active)
+            return single_direction(si, u, v, active, delta)
         rough = is_one_of(self._rough_glass, si)
-        sample, weight = si.bsdf().sample(single, si, u, v, active & ~rough)
+        sample, weight = single_direction(si, u, v, active & ~rough, delta)
         every, its = si.bsdf().sample(mi.BSDFContext(), si, u, v, active & rough)
         return dr.select(rough, every, sample), dr.select(rough, its, weight)
 

@@ -17,6 +17,7 @@ from mi_sparse_prt.emission.emitters import SceneEmitters
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.scene import surfaces
 from mi_sparse_prt.scene.loading import load_scene
+from mi_sparse_prt.scene.materials import single_direction
 from mi_sparse_prt.scene.mesh_cleaning import check_geometry
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
@@ -357,6 +358,28 @@ def test_bump_maps_and_masks_are_not_called_diffuse() -> None:
         original = mi.load_dict({"type": "scene", "s": {"type": "rectangle", "bsdf": bsdf}})
         with pytest.warns(PrtWarning, match=message):
             assert not Scene.from_mitsuba(original, INF).diffuse
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "plastic"},
+        {"type": "blendbsdf", "weight": 0.56, "a": {"type": "diffuse"}, "b": {"type": "plastic"}},
+        {"type": "dielectric"},
+    ],
+)
+def test_random_numbers_that_are_one_send_no_infinite_light(bsdf: dict) -> None:
+    """Mitsuba's samplers return 1 now and then, and blends round: the lobe is then one that was not asked for."""
+    made = mi.load_dict({"type": "sphere", "bsdf": bsdf})
+    numbers = np.float32([1, np.nextafter(np.float32(0.56), 0), 0.3, 0.001])
+    scene = mi.load_dict({"type": "scene", "sphere": made})
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.5, 0.2, dr.full(mi.Float, 3, 4)), mi.Vector3f(0, 0, -1)))
+    delta = int(mi.BSDFFlags.Delta)
+    sample, weight = single_direction(si, mi.Float(numbers), mi.Point2f(0.3, 0.6), mi.Mask(True), delta)
+    weight, single = np.array(weight), (np.array(sample.sampled_type) & delta) != 0
+    assert np.isfinite(weight).all()
+    assert (weight[:, single] > 0).all() and single[3]
+    assert (weight[:, ~single] == 0).all()
 
 
 @pytest.mark.parametrize("value", [1.5, -0.1, float("nan")])
