@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.passed_light import PassingLight, _sum_beside
+from mi_sparse_prt.solvers.passed_light import PassingLight, _are_alike, _sum_beside
 from mi_sparse_prt.solvers.refined_mean import Limit
 
 
@@ -88,6 +88,21 @@ def test_elements_without_edges(problem):
     ]
     assert np.array_equal(light._without_edges(), expected)
     assert 0.1 < np.mean(expected) < 0.9
+
+
+def test_light_that_rounding_leaves_at_the_horizon():
+    """A cosine of exactly 0 beside light that came by one of 1e-9: an edge, and no division by it."""
+    lighting = prt.CubemapLighting(1)
+    beside = lighting.sides.tables.beside
+    normals, powers = np.float32([[0, 1, 0]]), lighting.solid_angles / np.float32(np.pi)
+    up, side = (int(np.argmax(lighting.directions @ axis)) for axis in ([0, 1, 0], [1, 0, 0]))
+    assert lighting.directions[side, 1] == 0
+    columns = np.sort([up, side]).astype(np.int32)
+    values = np.where(columns == up, powers[up], 1e-9).astype(np.float32)
+    found, alike = (np.int32([0, 2]), columns, values), np.ones(2, bool)
+    where = normals, lighting.directions, powers
+    _are_alike(0, 1, np.array([0, 2]), columns.astype(np.int64), found, where, beside, alike)
+    assert alike.tolist() == [bool(c == up) for c in columns]
 
 
 def test_few_rays_without_edges_take_nothing_away(problem):
