@@ -84,7 +84,10 @@ class FactoredSparse:
         """Add ``left @ right rho x``, without ``rest``, to n rows of a result from ``row`` on: see ``add_scaled``."""
         if not len(self.rows):
             return
-        work = self.inner * self.rows.shape[1] + self.right.indptr[self.inner]  # of all groups before each
+        sizes = np.count_nonzero(self.rows >= 0, axis=1)
+        work = (
+            row_starts(np.diff(self.inner) * sizes) + self.right.indptr[self.inner]
+        )  # of all groups before each
         shares = np.linspace(0, work[-1], numba.get_num_threads() + 1)
         bounds = np.searchsorted(work, shares)
         bounds[0], bounds[-1] = 0, len(self.rows)
@@ -109,12 +112,15 @@ def _add_products(
 ) -> None:
     """Groups bounds[t] to bounds[t + 1] as the t-th part."""
     bounds, rows, inner, weights = left
-    width, size = light.shape[1], rows.shape[1]
-    found, total = np.empty((ABREAST, width), np.float32), np.empty((size, width), np.float32)
+    width, most = light.shape[1], rows.shape[1]
+    found, total = np.empty((ABREAST, width), np.float32), np.empty((most, width), np.float32)
     for t in range(first, last):
         for h in range(len(albedo)):
             for g in range(bounds[t], bounds[t + 1]):
-                total[:] = 0
+                size = most
+                while size and rows[g, size - 1] < 0:
+                    size -= 1
+                total[:size] = 0
                 for ray in range(inner[g], inner[g + 1], ABREAST):
                     count = min(ABREAST, inner[g + 1] - ray)
                     _add_up(ray, count, right, albedo[h], light, found)

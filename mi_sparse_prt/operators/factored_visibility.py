@@ -26,8 +26,8 @@ from mi_sparse_prt.reflection.frames import frames
 
 LANES = 4  # terms at a time
 
-#: Numbers of glossy points, their frames, the numbers of their tables, and these.
-GlossyPoints = tuple[NDArray[np.int64], Floats, NDArray[np.int64], Floats]
+#: Numbers of glossy points, their frames, the numbers of their tables, these, and how many terms each has.
+GlossyPoints = tuple[NDArray[np.int64], Floats, NDArray[np.int64], Floats, NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,19 @@ class FactoredVisibility(Operator):
         return np.column_stack([self.lighting.directions, self.visibility.falloffs]).astype(np.float32)
 
     @cached_property
+    def own_terms(self) -> NDArray[np.int64]:
+        """Terms (materials,) of each table: those after them are 0."""
+        some = np.any(self.tables != 0, axis=(1, 2))
+        return np.where(some.any(axis=1), self.terms - np.argmax(some[:, ::-1], axis=1), 0)
+
+    @cached_property
     def _padded(self) -> Floats:
         """Tables with as many terms as vector instructions take."""
         return np.pad(self.tables, ((0, 0), (0, 0), (0, 0), (0, -self.terms % LANES)))
 
     def _points(self, which: Ids | slice = slice(None)) -> GlossyPoints:
         vertices = self.glossy[which]
-        return vertices, self.frames[which], self.material[vertices], self._padded
+        return vertices, self.frames[which], self.material[vertices], self._padded, self.own_terms
 
     def rows(self, ids: Ids) -> Floats:
         ids = np.asarray(ids)
@@ -244,9 +250,18 @@ class RowSelection(Operator):
 
 @numba.njit(fastmath=True, inline="always")
 def _add(
-    total: Floats, place: int, table: Floats, frame: Floats, u: Any, v: Any, w: Any, spread: Any, weight: Any
+    total: Floats,
+    place: int,
+    table: Floats,
+    terms: int,
+    frame: Floats,
+    u: Any,
+    v: Any,
+    w: Any,
+    spread: Any,
+    weight: Any,
 ) -> None:
-    """Add weight times the values of a table (size, size, K) in direction (u, v, w), turned by a frame.
+    """Add weight times the first values of a table (size, size, K) in direction (u, v, w), turned by a frame.
 
     What it stands for has heights evenly around its own, as far as ``spread``: those above the horizon count.
 
@@ -263,7 +278,7 @@ def _add(
     a, b = a - np.float32(column), b - np.float32(row)
     p, q = weight * (one - a) * (one - b), weight * a * (one - b)
     r, s = weight * (one - a) * b, weight * a * b
-    for first in range(0, table.shape[2], LANES):
+    for first in range(0, terms, LANES):
         for lane in range(LANES):
             k = first + lane
             total[place, k] += (
@@ -286,7 +301,7 @@ def _expanded(
     result: Floats,
 ) -> None:
     """Terms (n, terms, m) at texels (m,), whose directions and spreads are (4, m)."""
-    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
+    (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
     value, terms = np.empty((1, tables.shape[3]), np.float32), result.shape[1]
     for i in range(start, end):
         first, last = starts[vertices[i]], starts[vertices[i] + 1]
@@ -303,7 +318,7 @@ def _expanded(
                 continue
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, weight)
+            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, weight)
             for k in range(terms):
                 result[i, k, j] = value[0, k]
 
@@ -321,7 +336,7 @@ def _single(
     result: Floats,
 ) -> None:
     """One term (m,) at one texel each, whose directions and spreads are (m, 4)."""
-    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
+    (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
     value = np.empty((1, tables.shape[3]), np.float32)
     for i in range(start, end):
         weight = power[i] * np.float32(bit_of(bits[vertices[i]], texels[i]))
@@ -334,7 +349,7 @@ def _single(
             continue
         value[:] = 0
         u, v, w, h = directions[i, 0], directions[i, 1], directions[i, 2], directions[i, 3]
-        _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, weight)
+        _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, weight)
         result[i] = value[0, term[i]]
 
 
@@ -349,7 +364,7 @@ def _relit(
     result: Floats,
 ) -> None:
     """Coefficients (n, terms, 3) under lights power (n_directions, 3), solid angles included."""
-    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
+    (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
     total = np.empty((3, tables.shape[3]), np.float32)
     value = np.empty((1, tables.shape[3]), np.float32)
     for i in range(start, end):
@@ -359,18 +374,18 @@ def _relit(
                 continue
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, np.float32(1))
+            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, np.float32(1))
             for c in range(3):
-                for k in range(tables.shape[3]):
+                for k in range(counts[materials[i]]):
                     total[c, k] += value[0, k] * power[j, c]
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = listed[e]
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], frames[i], u, v, w, h, more)
+            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, more)
             for c in range(3):
-                for k in range(tables.shape[3]):
+                for k in range(counts[materials[i]]):
                     total[c, k] += value[0, k] * power[j, c]
         for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
@@ -394,7 +409,7 @@ def _combined(
 
     ``place`` says where among ``words`` a word is, or -1.
     """
-    (bits, starts, listed, shares), (vertices, frames, materials, tables) = seen, points
+    (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
     width = power.shape[1]
     total = np.empty((width, tables.shape[3]), np.float32)
     for i in range(start, end):
@@ -412,7 +427,7 @@ def _combined(
                     directions[g, 2, b],
                     directions[g, 3, b],
                 )
-                _add(total, b, tables[materials[i]], frames[i], u, v, w, h, power[g, b])
+                _add(total, b, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, power[g, b])
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = int(listed[e])
             g, b = place[j // width], j % width
@@ -420,7 +435,18 @@ def _combined(
                 continue
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w, h = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b], directions[g, 3, b]
-            _add(total, b, tables[materials[i]], frames[i], u, v, w, h, power[g, b] * more)
+            _add(
+                total,
+                b,
+                tables[materials[i]],
+                counts[materials[i]],
+                frames[i],
+                u,
+                v,
+                w,
+                h,
+                power[g, b] * more,
+            )
         for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
                 result[i, k, c] = total[c, k]

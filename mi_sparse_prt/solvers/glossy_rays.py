@@ -93,8 +93,9 @@ class GatherRays:
         From how far two halves of them differ, at some vertices and under random sums of columns, in one channel.
         """
         order = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
-        weights = np.where(direct.material[self.points] >= 0, 1 + direct.terms, 0) * self.counts
-        entries = np.cumsum((weights + self.entries(direct.material, direct.terms))[order])
+        own, terms = direct.material[self.points], direct.own_terms
+        weights = np.where(own >= 0, 1 + terms[own], 0) * self.counts
+        entries = np.cumsum((weights + self.entries(direct.material, terms))[order])
         which = np.sort(order[: max(1, int(np.searchsorted(entries, NOISE_ENTRIES, side="right")))])
         ids, n = self.points[which], len(direct.material)
         light = np.empty((direct.shape[0], min(BITS, direct.shape[1])), np.float32)
@@ -118,10 +119,11 @@ class GatherRays:
         noise, bounce, every = np.sqrt(np.maximum(squares, 1e-30))
         return Noise(float(noise / bounce), float(bounce / every))
 
-    def entries(self, material: NDArray[np.integer], terms: int) -> NDArray[np.int64]:
-        """How many numbers (n,) the rays of each point find: what they meet, and the terms of that."""
-        shiny = np.concatenate([[0], np.cumsum(material[self.seen] >= 0)])[row_starts(self.counts)]
-        return self.counts + terms * np.diff(shiny)
+    def entries(self, material: NDArray[np.integer], terms: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many numbers (n,) the rays of each point find: what they meet, and the terms (materials,) of that."""
+        met = material[self.seen]
+        of_terms = np.cumsum(np.where(met >= 0, terms[met], 0))
+        return self.counts + np.diff(np.concatenate([[0], of_terms])[row_starts(self.counts)])
 
     def _half(self, which: NDArray[np.integer], half: bool, material: NDArray[np.integer]) -> GatherRays:
         """Half of the rays of some points, by their place among all."""
@@ -213,11 +215,12 @@ def gather_matrices(
     shape = len(nodes) + direct.shape[0] - n, direct.shape[0]
     node, number = _numbers(nodes, n), _numbers(direct.glossy, n)
     of_terms = len(nodes) + number[rays.points[glossy]][:, None] * terms + np.arange(terms)
+    of_terms[np.arange(terms) >= direct.own_terms[direct.material[rays.points[glossy]]][:, None]] = -1
     rows = np.column_stack([node[rays.points[glossy]], of_terms])
     share, inner = np.float32(1 / rays.per_vertex), row_starts(rays.counts[glossy])
     weights = share * np.column_stack([np.ones(len(rays.into), np.float32), rays.into])
     lengths = np.zeros(shape[0], np.int64)
-    lengths[node[rays.points[~glossy]]] = rays.entries(direct.material, terms)[~glossy]
+    lengths[node[rays.points[~glossy]]] = rays.entries(direct.material, direct.own_terms)[~glossy]
     starts = row_starts(lengths)
     right, found = (
         _met(direct, rays, np.flatnonzero(np.repeat(of, rays.counts)), channels) for of in (glossy, ~glossy)
@@ -239,11 +242,12 @@ def _met(
     """What some rays find (rays, n), in each channel: the light of a vertex and, if it is glossy, of all its terms."""
     number = _numbers(direct.glossy, len(direct.material))[rays.seen]
     shiny = np.cumsum(number >= 0) - 1  # its place among rays that meet such
-    starts = row_starts(np.where(number[some] >= 0, 1 + direct.terms, 1))
+    counts = np.append(direct.own_terms, 0)[direct.material[rays.seen]]  # of terms
+    starts = row_starts(1 + counts[some])
     columns, found = np.empty(starts[-1], np.int32), list[scipy.sparse.csr_array]()
     out = rays.out.reshape(len(rays.out), rays.out.shape[1] // direct.terms, direct.terms)
     for channel in range(channels):
-        met, values = (rays.seen, number, shiny, out, channel), np.empty(starts[-1], np.float32)
+        met, values = (rays.seen, number, counts, shiny, out, channel), np.empty(starts[-1], np.float32)
         run_in_parts(_fill, len(some), some, met, len(direct.material), starts, columns, values)
         found.append(sparse_of_rows(values, columns, starts, direct.shape[0]))  # all have the same columns
     return found
@@ -254,19 +258,18 @@ def _fill(
     first: int,
     last: int,
     rays: NDArray[np.int64],
-    met: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], Floats, int],
+    met: tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Floats, int],
     n: int,
     starts: NDArray[np.int64],
     columns: NDArray[np.int32],
     values: Floats,
 ) -> None:
     """Columns and values of what each ray finds, the diffuse part of a vertex first, in one channel."""
-    seen, number, shiny, out, channel = met
+    seen, number, counts, shiny, out, channel = met
     terms = out.shape[2]
     for i in range(first, last):
         ray, at = rays[i], starts[i]
         columns[at], values[at] = seen[ray], 1
-        if number[ray] >= 0:
-            for k in range(terms):
-                columns[at + 1 + k] = n + number[ray] * terms + k
-                values[at + 1 + k] = out[shiny[ray], channel, k]
+        for k in range(counts[ray]):
+            columns[at + 1 + k] = n + number[ray] * terms + k
+            values[at + 1 + k] = out[shiny[ray], channel, k]
