@@ -44,7 +44,7 @@ class SpecularSteps:
             averaging = SpecularNoise(problem, seed)
         self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
         self._search.refine(AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0)
-        self._terms = term_rows(problem, seed) if problem.reflection.terms else None
+        self._terms = term_rows(problem, seed, self._search.passed) if problem.reflection.terms else None
 
     @property
     def seen(self) -> Bits | None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.reflection.brdf_factors import (
+    MOST_TERMS,
     BrdfFactors,
     UnfactorableError,
     diffuse_reflectance,
@@ -30,11 +31,11 @@ from mi_sparse_prt.scene.notes import Fact, Notes, listed
 from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
-# Factors that tell what followed surfaces send to others, by which it is blurred: so exact, or so many at most. What a
-# ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball under six environments is 42 to 49% off if it counts as
-# diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are no better than none
-BETWEEN, MOST_BETWEEN, FEWEST = 0.25, 8, 3
-ROWS = 160_000  # of these factors, where as few will do: their form factors take memory and time
+BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
+# Of these factors, where as few will do: their form factors take memory and time. What a ground of copper (alpha 0.1 to
+# 0.3) sends to a wall and a ball under six environments is 42 to 49% off if it counts as diffuse, 18 to 30% with 3
+# factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are no better than none
+ROWS, FEWEST = 160_000, 3
 VERTICES = 160_000  # that are glossy; where there are more, followed surfaces are left out
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
@@ -103,7 +104,7 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
         for mesh, material in zip(scene.meshes, scene.materials, strict=True)
         if material.glossy
     )
-    between = int(np.clip(ROWS // max(glossy, 1), FEWEST, MOST_BETWEEN)) if glossy <= VERTICES else 0
+    between = int(np.clip(ROWS // max(glossy, 1), FEWEST, MOST_TERMS)) if glossy <= VERTICES else 0
     choice = _Choice(bound, between)
     found = _with_factors(scene, choice.factors)
     choice.warn()

@@ -27,6 +27,9 @@ SHOWN = PLAIN | {"BlendBSDF", "Mask", "Null", "SmoothPlastic", "RoughPlastic", "
 SHOWN |= {"RoughDielectric", "ThinDielectric", "SmoothConductor", "RoughConductor"}
 SHOWN |= {"BitmapTexture", "Checkerboard", "MeshAttribute", "Transform"}
 
+#: Textures that are looked up by texture coordinates.
+FLAT_TEXTURES = {"BitmapTexture", "Checkerboard"}
+
 #: BSDFs that bend the shading normal of the one that they wrap.
 BUMPED = {"NormalMap", "BumpMap"}
 
@@ -125,6 +128,8 @@ class Material:
         It sends light on in other single directions, or is rough glass.
     passes_straight : bool
         Some of it goes straight on, as if nothing were there.
+    textured : bool
+        It is looked up by texture coordinates.
     constant : bool
         It certainly does not vary over the surface nor with its rotation, and neither does the shape's own light.
     """
@@ -161,6 +166,7 @@ class Material:
         self.passes_straight = bool(flags & int(mi.BSDFFlags.Null))
         self.two_sided = any(_reflects_behind(int(bsdf.flags(k))) for k in range(bsdf.component_count()))
         textured = self._radiance is not None and self._radiance.is_spatially_varying()
+        self.textured = bool(self._classes & FLAT_TEXTURES)
         self.constant = self._classes <= PLAIN and not textured
 
     @property

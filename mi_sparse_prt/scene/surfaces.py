@@ -52,6 +52,12 @@ _INWARDS = (
 _FACES_INWARDS = Fact(_INWARDS.format("its"), _INWARDS.format("their"))
 _NO_AREA = Fact(": {} triangles without area are left out")
 _NO_TRIANGLE = Fact(": {} vertices that no triangle uses are left out")
+_NO_COORDINATES = Fact(
+    " has a texture and no texture coordinates: Mitsuba then takes those of each triangle, which are others where long "
+    "edges are bisected (give it coordinates, or set edge_length to inf)",
+    " have textures and no texture coordinates: Mitsuba then takes those of each triangle, which are others where long "
+    "edges are bisected (give them coordinates, or set edge_length to inf)",
+)
 _NO_NORMAL = Fact(": {} vertices have a normal of length zero; it is computed from their faces")
 
 
@@ -110,6 +116,12 @@ def read_surfaces(
         whole.append(mesh)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
+            if (
+                material.textured
+                and mesh.texcoords is None
+                and len(mesh.positions) > len(whole[-1].positions)
+            ):
+                notes.add(where.name, _NO_COORDINATES)
         limit -= len(mesh.positions)
         surfaces.append((mesh, material))
     _note_inwards(whole, materials, notes)

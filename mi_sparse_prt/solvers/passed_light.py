@@ -36,7 +36,7 @@ class PassingLight:
         if problem.basis == "direction" or strata == 1:
             self.seen, self._found = _seen_and_passed(DirectSolver(replace(problem, basis="direction")), ids)
         else:
-            self._found = passed_light(DirectSolver(problem, strata, next(self._seeds)), ids)
+            self._found = _passed_light(DirectSolver(problem, strata, next(self._seeds)), ids)
         self._rays = len(ids) * problem.emission.size * (strata**2 if self.seen is None else 1)
         self._rows, self._texels = _with_neighbours(self._found, problem)
 
@@ -138,7 +138,7 @@ def _beside(problem: Problem) -> Sparse:
     return scipy.sparse.coo_array((ones, near), shape=(len(beside),) * 2).tocsr()
 
 
-def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
+def _passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
     """Light (n, k * m) of texels, at some points, of which surfaces on the way let a part through, straight on.
 
     All of it, and nothing, is told by bits; here is what lies between, side by side by depth (``SpecularLight``).
@@ -153,7 +153,7 @@ def passed_light(direct: DirectSolver, ids: Ids) -> Sparse:
 
 
 def _seen_and_passed(direct: DirectSolver, ids: Ids) -> tuple[Bits, Sparse]:
-    """``passed_light`` in the direction basis, and which points see the centres of texels."""
+    """``_passed_light`` in the direction basis, and which points see the centres of texels."""
     seen, blocks, size = [direct.row_storage(0)], [], direct.block_size
     for a in range(0, len(ids), size):
         some = np.asarray(ids[a : a + size])

@@ -25,7 +25,7 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lamps import LampRays
 from mi_sparse_prt.solvers.passed_light import PassingLight
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.refined_mean import Averaging, Doubles, Limit
+from mi_sparse_prt.solvers.refined_mean import Averaging, Doubles, Limit, RefinedMean
 from mi_sparse_prt.solvers.specular_chains import Sparse
 
 SAMPLE = 512  # points that tell how much direct light there is
@@ -152,15 +152,21 @@ class SpecularSearch:
         seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 128)]
         power = np.square(problem.reflection.albedo[every].astype(np.float64))
         self._direct, self._depths = _direct_norm(problem, every, power, seeds[-1]), problem.depths_apart
-        self._parts, self.seen = [], None
+        self._parts, self.seen, self._passing = list[RefinedMean](), None, None
         if problem.scene.bends_light:
             self._parts.append(
                 BentLight(problem, every, power, seeds[:32]).estimated(options.first, options.last, averaging)
             )
         if problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting):
             passing = PassingLight(problem, every, power, seeds[32:-1])
-            self._parts.append(passing.estimated(max(1, options.last) if options.once else None))
+            self._passing = passing.estimated(max(1, options.last) if options.once else None)
+            self._parts.append(self._passing)
             self.seen = passing.seen
+
+    @property
+    def passed(self) -> Sparse | None:
+        """Light that goes straight on, as far as it was found: of all channels, as ``SpecularLight.matrices``."""
+        return None if self._passing is None else self._passing.mean()[0]
 
     @property
     def error(self) -> float:

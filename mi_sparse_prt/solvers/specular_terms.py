@@ -18,9 +18,7 @@ from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.bent_light import LEAST_SHARE
-from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.lobes import Lobes
-from mi_sparse_prt.solvers.passed_light import passed_light
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SPECULAR, SpecularLight
 from mi_sparse_prt.solvers.specular_chains import (
@@ -73,7 +71,7 @@ class TermRows(NamedTuple):
         return replace(specular, matrices=matrices, rays=specular.rays + self.rays)
 
 
-def term_rows(problem: Problem, seed: int) -> TermRows:
+def term_rows(problem: Problem, seed: int, passed: Sparse | None = None) -> TermRows:
     """Specular light as the terms of glossy vertices receive it.
 
     Light by way of mirrors and glass is weighted by incident factors in the direction of each ray, and is noisier than
@@ -84,6 +82,8 @@ def term_rows(problem: Problem, seed: int) -> TermRows:
     problem : Problem
         With in-out factors, at the vertices of its scene.
     seed : int
+    passed : (n, k * n_directions) sparse float32, optional
+        Unit-albedo light that goes straight on, if there is any, as ``SpecularLight.matrices`` have it.
     """
     reflection = problem.reflection
     assert isinstance(reflection, InOutFactors)
@@ -92,8 +92,8 @@ def term_rows(problem: Problem, seed: int) -> TermRows:
     chains = _TermChains(problem)
     width = problem.emission.size * max(problem.depths_apart, 1)
     parts = [chains.bent(ids, lobes, *bent_seeds)] if problem.scene.bends_light else []
-    if problem.scene.passes_straight:
-        parts.append(_straight(problem, ids, lobes))
+    if passed is not None:
+        parts.append(_straight(passed[ids], problem, ids, lobes))
     found = [_stacked(part, reflection.terms, width) for part in parts]
     return TermRows(_added(found), chains.traced)
 
@@ -145,9 +145,8 @@ class _TermChains(SpecularChains):
             yield _Light(of_lane[lanes], columns, into[lanes], light.T * share[lanes, None])
 
 
-def _straight(problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[tuple[int, list[_Light]]]:
-    """Light that comes straight through surfaces which let a part of it pass."""
-    found = passed_light(DirectSolver(problem), ids)
+def _straight(found: Sparse, problem: Problem, ids: Ids, lobes: Lobes) -> Iterator[tuple[int, list[_Light]]]:
+    """Light that comes straight through surfaces which let a part of it pass, found as unit-albedo rows of points."""
     step = max(1, LANES // 8 // problem.emission.size)
     for first in range(0, len(ids), step):
         some = found[first : first + step].tocoo()

@@ -1,11 +1,92 @@
 """Rays of glossy vertices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from conftest import T, build, diffuse
+from conftest import T, build, diffuse, problem_at
+from numpy.testing import assert_allclose
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
+from mi_sparse_prt.reflection import surfaces
+from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tables
+from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
+from mi_sparse_prt.solvers.glossy_rays import gather_matrices, gather_rays
+
+METAL = {"type": "roughconductor", "material": "Cu", "alpha": 0.2}
+
+
+def corner():
+    """A metal floor before a wall of a rough plastic and a diffuse one."""
+    return build(
+        0.6,
+        floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": METAL},
+        wall={
+            "type": "rectangle",
+            "to_world": T().translate([0, 1, -1]),
+            "bsdf": {"type": "roughplastic", "alpha": 0.4, "diffuse_reflectance": 0.3},
+        },
+        side={
+            "type": "rectangle",
+            "to_world": T().translate([-1, 1, 0]).rotate([0, 1, 0], 90),
+            "bsdf": diffuse(0.5, 0.4, 0.3),
+        },
+    )
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_terms_that_a_brdf_does_not_have_change_nothing():
+    """
+    Rationale: a wall with two terms beside a floor with six has rows of four terms that are 0.
+    Expected: sums of rays as if the wall had six, of which four are next to nothing; fewer numbers are kept.
+    """
+    scene = corner()
+    found = vertex_reflection(scene, 6)
+    wall = found.material[scene.meshes[1].vertices.start]
+    factors = list(found.factors)
+    factors[wall] = factors[wall].first(2)
+    short = replace(found, factors=tuple(factors))
+    problem = replace(problem_at(scene, prt.CubemapLighting(4), basis="texel"), reflection=short)
+    lighting = problem.emission
+    visibility = prt.precompute(scene, lighting, "gather", max_depth=2, progress=False).operators["direct"]
+    tables = incident_tables(short.factors, texels=lighting.n_directions)
+    assert tables.shape[3] == 6 and not tables[wall, ..., 2:].any()
+    outgoing = np.ascontiguousarray(np.moveaxis(outgoing_tables(short.factors), 4, 0))
+    every = np.arange(scene.n_vertices)
+    rays = gather_rays(problem, outgoing, 64, 3, every)
+    light = np.random.default_rng(2).random((scene.n_vertices + 6 * len(short.glossy), 5), np.float32)
+    sums, sizes = [], []
+    for own in (tables, np.where(tables == 0, np.float32(1e-30), tables)):
+        direct = FactoredVisibility(visibility, short.tangents, short.material, own)
+        matrices = gather_matrices(direct, rays, 3, every)
+        sums.append(np.stack([m.tocsr() @ light for m in matrices]))
+        sizes.append(sum(m.nnz for m in matrices))
+        assert direct.own_terms[wall] == (2 if own is tables else 6)
+    of_wall = short.rows_of(every[scene.meshes[1].vertices])
+    assert_allclose(sums[0], sums[1], rtol=1e-5, atol=1e-6)
+    assert np.abs(sums[0][:, of_wall]).max() > 0.01
+    assert sizes[0] < 0.9 * sizes[1]
+
+
+def test_metals_of_many_vertices_keep_few_factors(monkeypatch):
+    """
+    Expected: a metal that cameras follow keeps all that light between surfaces needs while these are few; then as many
+        as there is room for, three at least; of too many vertices none, which a warning says.
+    """
+    scene = build(0.6, floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": METAL})
+    kept = []
+    for rows in (1 << 20, 5 * scene.n_vertices, scene.n_vertices):
+        monkeypatch.setattr(surfaces, "ROWS", rows)
+        with pytest.warns(prt.PrtWarning, match="cameras' rays go on"):
+            found = chosen_reflection(scene, 0.01)
+        assert found.factors[0].followed
+        kept.append(found.terms)
+    assert kept[0] > 8 and 3 < kept[1] <= 5 and kept[2] == 3
+    monkeypatch.setattr(surfaces, "VERTICES", scene.n_vertices - 1)
+    with pytest.warns(prt.PrtWarning, match="'floor' .RoughConductor at more than"):
+        assert chosen_reflection(scene, 0.01).terms == 0
 
 
 @pytest.mark.filterwarnings("ignore")

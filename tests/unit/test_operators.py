@@ -30,12 +30,14 @@ def part(form: str, name: str) -> Operator:
 
 
 def factored(form: str) -> FactoredVisibility:
-    """Every third point is glossy, of two BRDFs with three terms."""
+    """Every third point is glossy, of two BRDFs with three terms and with two."""
     rng, direct = np.random.default_rng(1), part(form, "direct")
     tangents = np.cross(direct.normals, rng.normal(size=(N, 3)))
     tangents = (tangents / np.linalg.norm(tangents, axis=1, keepdims=True)).astype(np.float32)
     material = np.where(np.arange(N) % 3 == 0, np.arange(N) % 2, -1)
-    return FactoredVisibility(direct, tangents, material, rng.normal(size=(2, 8, 8, 3)).astype(np.float32))
+    tables = rng.normal(size=(2, 8, 8, 3)).astype(np.float32)
+    tables[1, ..., 2] = 0
+    return FactoredVisibility(direct, tangents, material, tables)
 
 
 def interpolated(dense: Operator) -> Interpolated:

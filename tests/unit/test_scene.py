@@ -671,6 +671,21 @@ def test_what_is_left_out_of_many_shapes_is_added_up(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(("coordinates", "edge_length", "told"), [(0, 0.2, 1), (0, INF, 0), (1, 0.2, 0)])
+def test_textures_without_coordinates_are_named_where_triangles_change(
+    tmp_path: Path, coordinates: int, edge_length: float, told: int
+) -> None:
+    bsdf = '<bsdf type="diffuse"><texture name="reflectance" type="checkerboard"/></bsdf>'
+    write_ply(tmp_path / "part.ply", SQUARE, [[0, 1, 2], [0, 2, 3]])
+    bare = f'<shape type="ply" id="backdrop"><string name="filename" value="part.ply"/>{bsdf}</shape>'
+    content = f'<shape type="rectangle" id="backdrop">{bsdf}</shape>' if coordinates else bare
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PrtWarning)
+        scene = load_scene(write_xml(tmp_path / "x.xml", content), edge_length)
+    named = [note for note in scene.warnings if "no texture coordinates" in note]
+    assert len(named) == told and all(note.startswith("shape 'backdrop' has a texture") for note in named)
+
+
 def test_duplicate_vertices_are_kept(tmp_path: Path) -> None:
     scene = ply_scene(tmp_path, [*SQUARE, SQUARE[0], SQUARE[2]], [[0, 1, 2], [4, 5, 3]])
     assert scene.n_vertices == 6
