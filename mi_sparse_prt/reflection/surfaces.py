@@ -32,11 +32,10 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-# Of these factors, where as few will do: their form factors take memory and time. What a ground of copper (alpha 0.1 to
-# 0.3) sends to a wall and a ball under six environments is 42 to 49% off if it counts as diffuse, 18 to 30% with 3
-# factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are no better than none
+# Of these factors, at most: their form factors take memory and time. Where as many would be fewer than the fewest, there
+# are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball under six environments is 42 to 49% off
+# if it counts as diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are no better than none
 ROWS, FEWEST = 160_000, 3
-VERTICES = 160_000  # that are glossy; where there are more, followed surfaces are left out
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
     ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
@@ -104,8 +103,7 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
         for mesh, material in zip(scene.meshes, scene.materials, strict=True)
         if material.glossy
     )
-    between = int(np.clip(ROWS // max(glossy, 1), FEWEST, MOST_TERMS)) if glossy <= VERTICES else 0
-    choice = _Choice(bound, between)
+    choice = _Choice(bound, min(ROWS // max(glossy, 1), MOST_TERMS))
     found = _with_factors(scene, choice.factors)
     choice.warn()
     return Diffuse(scene.albedo) if found is None else found
@@ -119,7 +117,7 @@ class _Choice:
     bound : float
         See ``chosen_reflection``.
     between : int
-        Factors of followed surfaces, at most; 0 leaves these out.
+        Factors of followed surfaces, at most; fewer than three leave these out.
     """
 
     def __init__(self, bound: float, between: int) -> None:
@@ -144,8 +142,8 @@ class _Choice:
             self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > FOLLOWED * self._bound:
-            if not self._between:
-                self._left.setdefault(f"{kind} at more than {VERTICES} vertices", []).extend(names)
+            if self._between < FEWEST:
+                self._left.setdefault(f"{kind} at more than {ROWS // FEWEST} vertices", []).extend(names)
                 return None
             found, _ = factors_for_images(material.bsdf, names[0], BETWEEN, most=self._between)
             found = replace(found, followed=True)

@@ -73,18 +73,18 @@ def test_terms_that_a_brdf_does_not_have_change_nothing():
 def test_metals_of_many_vertices_keep_few_factors(monkeypatch):
     """
     Expected: a metal that cameras follow keeps all that light between surfaces needs while these are few; then as many
-        as there is room for, three at least; of too many vertices none, which a warning says.
+        as there is room for; where that is not three, none, which a warning says.
     """
     scene = build(0.6, floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": METAL})
     kept = []
-    for rows in (1 << 20, 5 * scene.n_vertices, scene.n_vertices):
+    for rows in (1 << 20, 5 * scene.n_vertices, 3 * scene.n_vertices):
         monkeypatch.setattr(surfaces, "ROWS", rows)
         with pytest.warns(prt.PrtWarning, match="cameras' rays go on"):
             found = chosen_reflection(scene, 0.01)
         assert found.factors[0].followed
         kept.append(found.terms)
     assert kept[0] > 8 and 3 < kept[1] <= 5 and kept[2] == 3
-    monkeypatch.setattr(surfaces, "VERTICES", scene.n_vertices - 1)
+    monkeypatch.setattr(surfaces, "ROWS", 3 * scene.n_vertices - 1)
     with pytest.warns(prt.PrtWarning, match="'floor' .RoughConductor at more than"):
         assert chosen_reflection(scene, 0.01).terms == 0
 
