@@ -32,9 +32,9 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-# Of these factors, at most: their form factors take memory and time. Where as many would be fewer than the fewest, there
-# are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball under six environments is 42 to 49% off
-# if it counts as diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are no better than none
+# Of these factors, at most: their form factors take memory and time. Where there would be fewer than the fewest, there
+# are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball, lit by six environments, is 42 to 49%
+# off if it counts as diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are as bad as none
 ROWS, FEWEST = 160_000, 3
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
