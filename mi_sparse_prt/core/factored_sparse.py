@@ -84,10 +84,8 @@ class FactoredSparse:
         """Add ``left @ right rho x``, without ``rest``, to n rows of a result from ``row`` on: see ``add_scaled``."""
         if not len(self.rows):
             return
-        sizes = np.count_nonzero(self.rows >= 0, axis=1)
-        work = (
-            row_starts(np.diff(self.inner) * sizes) + self.right.indptr[self.inner]
-        )  # of all groups before each
+        weights = np.diff(self.inner) * np.count_nonzero(self.rows >= 0, axis=1)
+        work = row_starts(weights) + self.right.indptr[self.inner]  # of all groups before each
         shares = np.linspace(0, work[-1], numba.get_num_threads() + 1)
         bounds = np.searchsorted(work, shares)
         bounds[0], bounds[-1] = 0, len(self.rows)

@@ -302,8 +302,9 @@ def _expanded(
 ) -> None:
     """Terms (n, terms, m) at texels (m,), whose directions and spreads are (4, m)."""
     (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
-    value, terms = np.empty((1, tables.shape[3]), np.float32), result.shape[1]
+    value, most = np.empty((1, tables.shape[3]), np.float32), result.shape[1]
     for i in range(start, end):
+        table, terms = tables[materials[i]], counts[materials[i]]
         first, last = starts[vertices[i]], starts[vertices[i] + 1]
         own = listed[first:last]
         for j in range(len(texels)):
@@ -313,13 +314,13 @@ def _expanded(
                 if e < len(own) and own[e] == texels[j]:
                     weight = power[j] * (np.float32(shares[first + e]) / np.float32(FULL))
             if weight == 0:
-                for k in range(terms):
+                for k in range(most):
                     result[i, k, j] = 0
                 continue
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, weight)
-            for k in range(terms):
+            _add(value, 0, table, terms, frames[i], u, v, w, h, weight)
+            for k in range(most):
                 result[i, k, j] = value[0, k]
 
 
@@ -339,6 +340,7 @@ def _single(
     (bits, starts, listed, shares), (vertices, frames, materials, tables, counts) = seen, points
     value = np.empty((1, tables.shape[3]), np.float32)
     for i in range(start, end):
+        table, terms = tables[materials[i]], counts[materials[i]]
         weight = power[i] * np.float32(bit_of(bits[vertices[i]], texels[i]))
         first, last = starts[vertices[i]], starts[vertices[i] + 1]
         e = first + np.searchsorted(listed[first:last], texels[i])
@@ -349,7 +351,7 @@ def _single(
             continue
         value[:] = 0
         u, v, w, h = directions[i, 0], directions[i, 1], directions[i, 2], directions[i, 3]
-        _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, weight)
+        _add(value, 0, table, terms, frames[i], u, v, w, h, weight)
         result[i] = value[0, term[i]]
 
 
@@ -368,24 +370,25 @@ def _relit(
     total = np.empty((3, tables.shape[3]), np.float32)
     value = np.empty((1, tables.shape[3]), np.float32)
     for i in range(start, end):
+        table, terms = tables[materials[i]], counts[materials[i]]
         total[:] = 0
         for j in range(directions.shape[1]):
             if (bits[vertices[i], j // 32] >> np.uint32(j % 32)) & np.uint32(1) == 0:
                 continue
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, np.float32(1))
+            _add(value, 0, table, terms, frames[i], u, v, w, h, np.float32(1))
             for c in range(3):
-                for k in range(counts[materials[i]]):
+                for k in range(terms):
                     total[c, k] += value[0, k] * power[j, c]
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = listed[e]
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w, h = directions[0, j], directions[1, j], directions[2, j], directions[3, j]
             value[:] = 0
-            _add(value, 0, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, more)
+            _add(value, 0, table, terms, frames[i], u, v, w, h, more)
             for c in range(3):
-                for k in range(counts[materials[i]]):
+                for k in range(terms):
                     total[c, k] += value[0, k] * power[j, c]
         for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
@@ -413,6 +416,7 @@ def _combined(
     width = power.shape[1]
     total = np.empty((width, tables.shape[3]), np.float32)
     for i in range(start, end):
+        table, terms = tables[materials[i]], counts[materials[i]]
         total[:] = 0
         for g in range(len(words)):
             mask = bits[vertices[i], words[g]]
@@ -427,7 +431,7 @@ def _combined(
                     directions[g, 2, b],
                     directions[g, 3, b],
                 )
-                _add(total, b, tables[materials[i]], counts[materials[i]], frames[i], u, v, w, h, power[g, b])
+                _add(total, b, table, terms, frames[i], u, v, w, h, power[g, b])
         for e in range(starts[vertices[i]], starts[vertices[i] + 1]):
             j = int(listed[e])
             g, b = place[j // width], j % width
@@ -435,18 +439,7 @@ def _combined(
                 continue
             more = np.float32(shares[e]) / np.float32(FULL) - np.float32(bit_of(bits[vertices[i]], j))
             u, v, w, h = directions[g, 0, b], directions[g, 1, b], directions[g, 2, b], directions[g, 3, b]
-            _add(
-                total,
-                b,
-                tables[materials[i]],
-                counts[materials[i]],
-                frames[i],
-                u,
-                v,
-                w,
-                h,
-                power[g, b] * more,
-            )
+            _add(total, b, table, terms, frames[i], u, v, w, h, power[g, b] * more)
         for k in range(result.shape[1]):  # not a slice: its error message alone compiles for seconds
             for c in range(len(total)):
                 result[i, k, c] = total[c, k]

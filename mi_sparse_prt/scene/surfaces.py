@@ -116,11 +116,8 @@ def read_surfaces(
         whole.append(mesh)
         if where.shape.is_mesh():
             mesh = subdivide(mesh, edge_length, limit)
-            if (
-                material.textured
-                and mesh.texcoords is None
-                and len(mesh.positions) > len(whole[-1].positions)
-            ):
+            finer = len(mesh.positions) > len(whole[-1].positions)
+            if finer and material.textured and mesh.texcoords is None:
                 notes.add(where.name, _NO_COORDINATES)
         limit -= len(mesh.positions)
         surfaces.append((mesh, material))

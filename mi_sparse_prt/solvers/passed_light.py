@@ -221,9 +221,7 @@ def _are_alike(
         for k in own:
             texel = columns[k] % size
             reaches = np.dot(normals[i], directions[texel]) * powers[texel]
-            if (
-                reaches > 0
-            ):  # at the horizon it is 0 here where the sum of three products was rounded otherwise
+            if reaches > 0:  # at the horizon 0 here, where the sum of three products was rounded otherwise
                 shares[texel], met[texel] = values[k] / reaches, columns[k] // size
         for k in range(starts[i], starts[i + 1]):
             share, same = shares[texels[k]], shares[texels[k]] > 0
