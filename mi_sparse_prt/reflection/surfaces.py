@@ -32,9 +32,9 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-# Of these factors, at most: their form factors take memory and time. Where there would be fewer than the fewest, there
-# are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball, lit by six environments, is 42 to 49%
-# off if it counts as diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16; 1 or 2 are as bad as none
+# Of factors that cannot be so exact, at most: their form factors take memory and time. Where there would be fewer than
+# the fewest, there are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball, lit by six
+# environments, is 42 to 49% off if it is diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16
 ROWS, FEWEST = 160_000, 3
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
@@ -116,12 +116,13 @@ class _Choice:
     ----------
     bound : float
         See ``chosen_reflection``.
-    between : int
-        Factors of followed surfaces, at most; fewer than three leave these out.
+    few : int
+        Factors, at most, of surfaces of which no number is exact enough for light between surfaces; less than three
+        leave these out.
     """
 
-    def __init__(self, bound: float, between: int) -> None:
-        self._bound, self._between = bound, between
+    def __init__(self, bound: float, few: int) -> None:
+        self._bound, self._few = bound, few
         self._left: dict[str, list[str]] = {}  # names of surfaces, by why no factors stand for them
         self._off: dict[str, list[str]] = {}  # by kind of BSDF and error
 
@@ -142,10 +143,11 @@ class _Choice:
             self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > FOLLOWED * self._bound:
-            if self._between < FEWEST:
+            most = MOST_TERMS if error <= BETWEEN else self._few
+            if most < FEWEST:
                 self._left.setdefault(f"{kind} at more than {ROWS // FEWEST} vertices", []).extend(names)
                 return None
-            found, _ = factors_for_images(material.bsdf, names[0], BETWEEN, most=self._between)
+            found, _ = factors_for_images(material.bsdf, names[0], BETWEEN, most=most)
             found = replace(found, followed=True)
         if error > self._bound:
             self._off.setdefault(f"{kind}, {error:.1%}", []).extend(names)

@@ -15,7 +15,7 @@ from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tab
 from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
 from mi_sparse_prt.solvers.glossy_rays import gather_matrices, gather_rays
 
-METAL = {"type": "roughconductor", "material": "Cu", "alpha": 0.2}
+METAL, BRUSHED = ({"type": "roughconductor", "material": "Cu", "alpha": alpha} for alpha in (0.2, 0.3))
 
 
 def corner():
@@ -72,21 +72,21 @@ def test_terms_that_a_brdf_does_not_have_change_nothing():
 
 def test_metals_of_many_vertices_keep_few_factors(monkeypatch):
     """
-    Expected: a metal that cameras follow keeps all that light between surfaces needs while these are few; then as many
-        as there is room for; where that is not three, none, which a warning says.
+    Expected: a metal that cameras follow keeps all that light between surfaces needs, or where 16 are not enough as
+        many as there is room for; where that is not three, none, which a warning says.
     """
-    scene = build(0.6, floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": METAL})
-    kept = []
-    for rows in (1 << 20, 5 * scene.n_vertices, 3 * scene.n_vertices):
-        monkeypatch.setattr(surfaces, "ROWS", rows)
-        with pytest.warns(prt.PrtWarning, match="cameras' rays go on"):
-            found = chosen_reflection(scene, 0.01)
-        assert found.factors[0].followed
-        kept.append(found.terms)
-    assert kept[0] > 8 and 3 < kept[1] <= 5 and kept[2] == 3
-    monkeypatch.setattr(surfaces, "ROWS", 3 * scene.n_vertices - 1)
+
+    def chosen(bsdf, rows):
+        scene = build(0.6, floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": bsdf})
+        monkeypatch.setattr(surfaces, "ROWS", int(rows * scene.n_vertices))
+        return chosen_reflection(scene, 0.01)
+
+    with pytest.warns(prt.PrtWarning, match="cameras' rays go on"):
+        many, some, few, exact = (chosen(*of) for of in ((METAL, 99), (METAL, 5), (METAL, 3), (BRUSHED, 3)))
+    assert many.terms > 12 and 3 < some.terms <= 5 and few.terms == 3 and exact.terms > 8
+    assert all(found.factors[0].followed for found in (many, some, few, exact))
     with pytest.warns(prt.PrtWarning, match="'floor' .RoughConductor at more than"):
-        assert chosen_reflection(scene, 0.01).terms == 0
+        assert chosen(METAL, 2.9).terms == 0
 
 
 @pytest.mark.filterwarnings("ignore")
