@@ -32,9 +32,10 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-# Of factors that cannot be so exact, at most: their form factors take memory and time. Where there would be fewer than
-# the fewest, there are none. What a ground of copper (alpha 0.1 to 0.3) sends to a wall and a ball, lit by six
-# environments, is 42 to 49% off if it is diffuse, 18 to 30% with 3 factors, 14 to 19% with 6, 11 to 18% with 16
+# Of factors that cannot be so exact, at most: their form factors take memory and time. What a ground of copper (alpha
+# 0.1 to 0.3) sends to a wall and a ball, lit by six environments, is 42 to 49% off if it is diffuse, 18 to 30% with 3
+# factors, 14 to 19% with 6, 11 to 18% with 16. Where there would be fewer than the fewest, no followed surface has any:
+# 14 at 70,000 vertices of a room took more than 24 GB
 ROWS, FEWEST = 160_000, 3
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
@@ -117,8 +118,8 @@ class _Choice:
     bound : float
         See ``chosen_reflection``.
     few : int
-        Factors, at most, of surfaces of which no number is exact enough for light between surfaces; less than three
-        leave these out.
+        Factors, at most, of followed surfaces of which no number is exact enough for light between surfaces; if that is
+        less than three, no followed surface has any.
     """
 
     def __init__(self, bound: float, few: int) -> None:
@@ -143,10 +144,12 @@ class _Choice:
             self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > FOLLOWED * self._bound:
-            most = MOST_TERMS if error <= BETWEEN else self._few
-            if self._few < FEWEST:  # 14 factors at 70,000 vertices of a room took more than 24 GB
-                self._left.setdefault(f"{kind} at more than {ROWS // FEWEST} vertices", []).extend(names)
+            if self._few < FEWEST:
+                self._left.setdefault(f"{kind} beside more than {ROWS // FEWEST} glossy vertices", []).extend(
+                    names
+                )
                 return None
+            most = MOST_TERMS if error <= BETWEEN else self._few
             found, _ = factors_for_images(material.bsdf, names[0], BETWEEN, most=most)
             found = replace(found, followed=True)
         if error > self._bound:
