@@ -33,8 +33,9 @@ from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.specular_steps import SpecularSteps
-from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
-from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
+from mi_sparse_prt.reconstruction.senders import choose_senders
+from mi_sparse_prt.reflection.reflection import Diffuse
+from mi_sparse_prt.reflection.surfaces import ChosenReflection, chosen_reflection, vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
@@ -174,9 +175,11 @@ def precompute(
         problem = Problem(scene, lighting, where, _diffuse(scene, where), basis, max_depth)
         return _lit_by_lamps(problem, settings, run)
     with run.clock.phase("setup"):
-        seen, settings = _reflection(scene, where, settings)
+        (seen, sent), settings = _reflection(scene, where, settings)
         apart = scene.specular and max_depth != 2
         problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
+        if sent is not None and max_depth != 2:
+            problem = replace(problem, sent=choose_senders(scene, problem.points, seen, sent))
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
 
@@ -194,7 +197,7 @@ class _Attempts:
             with run.clock.phase("specular"):
                 self._specular = SpecularSteps(self._problem, settings, run.seed, others)
             costs = None if costs is None else _beside_specular(costs, self._specular)
-        noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.light)
+        noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.sent)
         self._proposals = _proposals(direct, settings, costs, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, light)
 
@@ -303,21 +306,23 @@ def _diffuse(scene: Scene, where: Measurement) -> Diffuse:
     return Diffuse(scene.albedo if where.albedo is None else where.albedo)
 
 
-def _reflection(scene: Scene, where: Measurement, settings: Settings) -> tuple[Reflection, Settings]:
+def _reflection(scene: Scene, where: Measurement, settings: Settings) -> tuple[ChosenReflection, Settings]:
     """What points do with light, and settings that say how many terms that takes."""
     if settings.terms == AUTO_TERMS:
         refusal = settings.why_no_terms
         if settings.harmonics is None and refusal is None:
             bound = FACTOR_SHARE * (settings.target_error or TARGET)
             chosen = chosen_reflection(scene, bound)
-            if chosen.terms:
-                return chosen, replace(settings, terms=chosen.terms)
+            sending = chosen.sent or chosen.seen
+            if sending.terms:
+                return chosen, replace(settings, terms=sending.terms)
         elif refusal is not None:
             _warn_if_glossy(scene, refusal)
         settings = replace(settings, terms=0)
     if settings.view_dependent:
-        return vertex_reflection(scene, int(settings.terms), settings.harmonics), settings
-    return _diffuse(scene, where), settings
+        seen = vertex_reflection(scene, int(settings.terms), settings.harmonics)
+        return ChosenReflection(seen, None), settings
+    return ChosenReflection(_diffuse(scene, where), None), settings
 
 
 def _warn_if_glossy(scene: Scene, reason: str) -> None:

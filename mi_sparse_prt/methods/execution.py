@@ -21,6 +21,7 @@ from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.methods.sparse import SparseOptions, sparse_parts
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
+from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.operators.visibility import Visibility
 from mi_sparse_prt.reconstruction.gather_noise import GatherNoise
@@ -52,7 +53,7 @@ class Execution:
         Whether there is indirect light.
     run : Run
     specular : SpecularLight, optional
-        Where it is an operator of its own.
+        Where it is an operator of its own; with rows of all terms that vertices send (``Problem.sending``).
     """
 
     def __init__(
@@ -67,6 +68,9 @@ class Execution:
         self._settings, self._any_indirect, self._run = settings, indirect, run
         self._direct: dict[tuple[str, Strata | None], MethodResult] = {}
         self._specular, self._specular_rays = specular, 0 if specular is None else specular.rays
+        self._sent, sent = specular, self._problem.sent
+        if specular is not None and sent is not None:
+            self._specular = specular.take(sent.rows_of(self._problem.reflection))
 
     def parts(self, plan: Plan) -> MethodResult:
         """The parts of the matrix, and an account of what was evaluated for them by this call."""
@@ -112,11 +116,14 @@ class Execution:
         reflection = self._problem.reflection
         if not isinstance(reflection, InOutFactors):
             return light
-        assert isinstance(light.direct, Visibility | FractionalVisibility)
+        return replace(light, direct=self._factored(light.direct, reflection))
+
+    def _factored(self, seen: Operator | None, reflection: InOutFactors) -> FactoredVisibility:
+        """Direct light of all vertices with rows for terms."""
+        assert isinstance(seen, Visibility | FractionalVisibility)
         texels = self._problem.emission.n_directions if self._problem.basis == "texel" else None
         tables = incident_tables(reflection.factors, texels=texels)
-        factored = FactoredVisibility(light.direct, reflection.tangents, reflection.material, tables)
-        return replace(light, direct=factored)
+        return FactoredVisibility(seen, reflection.tangents, reflection.material, tables)
 
     def _exact(self) -> MethodResult:
         if self._problem.basis == "direction":
@@ -158,8 +165,8 @@ class Execution:
 
     def _gathered(self, plan: Plan, light: MethodResult) -> MethodResult:
         """With interreflections by finite elements."""
-        if isinstance(light.direct, FactoredVisibility):
-            return self._gathered_terms(plan, light, light.direct)
+        if isinstance(self._problem.sending, InOutFactors):
+            return self._gathered_terms(plan, light, self._problem.sending)
         problem, clock = self._problem, self._run.clock
         sources, known = problem.at_vertices, light
         if sources is not problem:  # vertices know the light that surfaces send out
@@ -193,15 +200,20 @@ class Execution:
         few = SpecularOptions(4, 4)
         return replace(known, specular=specular_light(sources, self._run.seed, few))
 
-    def _gathered_terms(self, plan: Plan, light: MethodResult, direct: FactoredVisibility) -> MethodResult:
+    def _gathered_terms(self, plan: Plan, light: MethodResult, sending: InOutFactors) -> MethodResult:
         """With interreflections among glossy surfaces."""
         with self._run.clock.phase("interreflection"):
-            problem, seed = self._problem, self._run.seed
+            problem, seed, seen = self._problem, self._run.seed, light.direct
+            direct = self._factored(
+                seen.visibility if isinstance(seen, FactoredVisibility) else seen, sending
+            )
             nodes = choose_nodes(problem.scene, problem.points)
-            specular = None if light.specular is None else light.specular.operator
+            specular = None if self._sent is None else self._sent.operator
             averaging = self._averaging(plan, problem, nodes)
             effort = GatherEffort(plan.rays, plan.tolerance, seed)
             part, noise = glossy_indirect(problem, direct, nodes, effort, specular, averaging)
+            if problem.sent is not None:
+                part = part.take(problem.sent.rows_of(problem.reflection))
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays} | _rays_of(averaging)
         # the rank that leaves this out grows with the rays, too

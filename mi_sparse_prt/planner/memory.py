@@ -81,7 +81,7 @@ def _direct(direct: DirectSolver, plan: Plan) -> tuple[float, float]:
 
 def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     """Bytes of form factors and of the low rank that is made with them."""
-    n, texels, reflection = len(direct.points), direct.lighting.n_directions, direct.problem.reflection
+    n, texels, reflection = len(direct.points), direct.lighting.n_directions, direct.problem.sending
     terms, rows, nodes = reflection.terms, reflection.row_count, node_count(direct.problem.scene)
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
@@ -103,10 +103,10 @@ def _rays_that_meet(direct: DirectSolver, rays: int) -> _Gathered:
     problem, n = direct.problem.at_vertices, len(direct.problem.at_vertices.points)
     some = np.sort(np.random.default_rng(0).choice(n, min(n, PILOT), replace=False))
     found, scale = gather_matrix(problem.scene, problem.points, rays, 0, some), n / len(some)
-    if not isinstance(problem.reflection, InOutFactors):
+    if not isinstance(problem.sending, InOutFactors):
         return _Gathered(scale * rays * float(found.sum()), scale * found.nnz)
     rows = np.ones(n)
-    rows[problem.reflection.glossy] += problem.reflection.terms
+    rows[problem.sending.glossy] += problem.sending.terms
     hits = rays * found
     own = np.where(rows > 1, rows, 0)[some]
     return _Gathered(

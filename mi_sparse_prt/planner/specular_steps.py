@@ -44,7 +44,8 @@ class SpecularSteps:
             averaging = SpecularNoise(problem, seed)
         self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
         self._search.refine(AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0)
-        self._terms = term_rows(problem, seed, self._search.passed) if problem.reflection.terms else None
+        self._terms = term_rows(problem, seed, self._search.passed) if problem.sending.terms else None
+        self._problem = problem
 
     @property
     def seen(self) -> Bits | None:
@@ -54,6 +55,12 @@ class SpecularSteps:
     @property
     def light(self) -> SpecularLight:
         """As far as it was found, with rows for terms."""
+        sent, found = self._problem.sent, self.sent
+        return found if sent is None else found.take(sent.rows_of(self._problem.reflection))
+
+    @property
+    def sent(self) -> SpecularLight:
+        """The same, with rows for all terms that surfaces send to each other."""
         found = self._search.light()
         return found if self._terms is None else self._terms.after(found)
 

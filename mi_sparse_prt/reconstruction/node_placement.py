@@ -18,6 +18,7 @@ from mi_sparse_prt.solvers.walls import Walls
 
 NODES = 1 << 16  # of a scene, if nothing else is asked for
 SMALL = 1 << 12  # vertices of a piece, of which none is left out; a larger piece has as many nodes at least
+FEW = 1 << 6  # the same, where nodes stand for light that others see from afar
 
 Ids = NDArray[np.int64]
 
@@ -74,6 +75,36 @@ def choose_nodes(
     vertices, nodes, values = (np.concatenate(column) for column in zip(*found, strict=True))
     ids, number = np.unique(nodes, return_inverse=True)
     return Nodes(ids, scipy.sparse.csr_array((values, (vertices, number)), shape=(n, len(ids))))
+
+
+def nearest_nodes(scene: Scene, points: Points, members: Ids, most: int, small: int = FEW) -> Ids:
+    """Of some vertices about ``most``, evenly spread over each piece, and for each vertex the nearest of these.
+
+    Parameters
+    ----------
+    scene, points
+        As for ``choose_nodes``.
+    members : (n,) int64
+        Ascending.
+    most, small : int
+        As for ``choose_nodes``.
+
+    Returns
+    -------
+    (n,) int64
+        Vertices; it may be one a little farther away where walls or other normals are between.
+    """
+    if len(members) <= most:
+        return members
+    piece = scene.pieces[members]
+    wanted, found = _wanted(np.bincount(piece), most, small), members.copy()
+    walls = Walls(scene, points)
+    for one in np.unique(piece):
+        own = np.flatnonzero(piece == one)
+        if wanted[one] < len(own):
+            near = _between_nodes(scene, points, walls, members[own], int(wanted[one]), 1)
+            found[np.searchsorted(members, near.vertices)] = near.nodes
+    return found
 
 
 def _wanted(sizes: Ids, most: int, small: int) -> Ids:

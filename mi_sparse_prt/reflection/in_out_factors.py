@@ -155,7 +155,6 @@ class InOutFactors(Reflection):
                     "heights": f.grid.heights,
                     "azimuths": f.grid.azimuths,
                     "varying_diffuse": f.varying_diffuse,
-                    "followed": f.followed,
                 }
                 for f in self.factors
             ],
@@ -190,8 +189,7 @@ def _read_factors(number: int, known: dict[str, Any], arrays: dict[str, NDArray[
         or channels not in (1, 3)
     ):
         raise ValueError(f"factors of BRDF {number} do not fit together")
-    flags = bool(known["varying_diffuse"]), bool(known.get("followed", False))
-    return BrdfFactors(grid, diffuse, incident, outgoing, *flags)
+    return BrdfFactors(grid, diffuse, incident, outgoing, bool(known["varying_diffuse"]))
 
 
 @numba.njit(parallel=True, fastmath=True, cache=True)

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.reflection.brdf_factors import (
-    MOST_TERMS,
     BrdfFactors,
     UnfactorableError,
     diffuse_reflectance,
@@ -32,11 +32,6 @@ from mi_sparse_prt.scene.scene import Scene
 
 TOO_NARROW = 0.5  # error of 16 factors that are left out: a diffuse surface in their place has 1
 BETWEEN = 0.1  # error of factors that tell what followed surfaces send to others, by which it is blurred
-# Of factors that cannot be so exact, at most: their form factors take memory and time. What a ground of copper (alpha
-# 0.1 to 0.3) sends to a wall and a ball, lit by six environments, is 42 to 49% off if it is diffuse, 18 to 30% with 3
-# factors, 14 to 19% with 6, 11 to 18% with 16. Where there would be fewer than the fewest, no followed surface has any:
-# 14 at 70,000 vertices of a room took more than 24 GB
-ROWS, FEWEST = 160_000, 3
 FOLLOWED = 2.0  # times the bound, which is the target error: to be more exact is not worth the noise of rays
 _TANGENTS = (
     ": {0} BSDF is anisotropic and {1} no texture coordinates: Mitsuba then takes the first edge of each triangle for "
@@ -81,12 +76,20 @@ def vertex_reflection(scene: Scene, terms: int = 0, harmonics: int | None = None
     return found
 
 
-def chosen_reflection(scene: Scene, bound: float) -> Reflection:
+class ChosenReflection(NamedTuple):
+    """R of a matrix, and that of light that surfaces send to each other, where it has more terms."""
+
+    seen: Reflection
+    sent: InOutFactors | None
+
+
+def chosen_reflection(scene: Scene, bound: float) -> ChosenReflection:
     """What vertices do with incident light, with as many in-out factors as images need.
 
     Delta lobes have none: what a camera's ray sees by way of mirrors and glass, it sees by going on. Surfaces that
     cannot be factored are left as diffuse, and followed by cameras (``relighting.followed_rays``). Followed are also
-    those whose factors miss twice the bound, which keep as few as light between surfaces needs. One warning names both.
+    those whose factors miss twice the bound; to others they send light by as few factors as that needs. One warning
+    names both.
 
     Parameters
     ----------
@@ -96,18 +99,25 @@ def chosen_reflection(scene: Scene, bound: float) -> Reflection:
 
     Returns
     -------
-    Reflection
-        ``Diffuse`` if no surface has factors.
+    ChosenReflection
+        Followed surfaces are as diffuse in ``seen``; ``sent`` is None if there are none with factors.
     """
-    glossy = sum(
-        mesh.vertices.stop - mesh.vertices.start
-        for mesh, material in zip(scene.meshes, scene.materials, strict=True)
-        if material.glossy
-    )
-    choice = _Choice(bound, min(ROWS // max(glossy, 1), MOST_TERMS))
-    found = _with_factors(scene, choice.factors)
+    choice = _Choice(bound)
+    every = _with_factors(scene, choice.factors)
     choice.warn()
-    return Diffuse(scene.albedo) if found is None else found
+    if every is None:
+        return ChosenReflection(Diffuse(scene.albedo), None)
+    shown = np.array([not factors.followed for factors in every.factors])
+    if shown.all():
+        return ChosenReflection(every, None)
+    followed = (every.material >= 0) & ~shown[every.material]
+    albedo = np.where(followed[:, None], scene.albedo, every.albedo)
+    if not shown.any():
+        return ChosenReflection(Diffuse(albedo), every)
+    number = np.where(shown, np.cumsum(shown) - 1, -1)
+    material = np.where(every.material < 0, -1, number[every.material])
+    factors = tuple(factors for factors in every.factors if not factors.followed)
+    return ChosenReflection(replace(every, albedo=albedo, material=material, factors=factors), every)
 
 
 class _Choice:
@@ -117,13 +127,10 @@ class _Choice:
     ----------
     bound : float
         See ``chosen_reflection``.
-    few : int
-        Factors, at most, of followed surfaces of which no number is exact enough for light between surfaces; if that is
-        less than three, no followed surface has any.
     """
 
-    def __init__(self, bound: float, few: int) -> None:
-        self._bound, self._few = bound, few
+    def __init__(self, bound: float) -> None:
+        self._bound = bound
         self._left: dict[str, list[str]] = {}  # names of surfaces, by why no factors stand for them
         self._off: dict[str, list[str]] = {}  # by kind of BSDF and error
 
@@ -144,13 +151,7 @@ class _Choice:
             self._left.setdefault(f"the lobe of {kind} is too narrow", []).extend(names)
             return None
         if error > FOLLOWED * self._bound:
-            if self._few < FEWEST:
-                self._left.setdefault(f"{kind} beside more than {ROWS // FEWEST} glossy vertices", []).extend(
-                    names
-                )
-                return None
-            most = MOST_TERMS if error <= BETWEEN else self._few
-            found, _ = factors_for_images(material.bsdf, names[0], BETWEEN, most=most)
+            found, _ = factors_for_images(material.bsdf, names[0], BETWEEN)
             found = replace(found, followed=True)
         if error > self._bound:
             self._off.setdefault(f"{kind}, {error:.1%}", []).extend(names)

@@ -72,9 +72,7 @@ def surfaces_to_follow(scene: Scene, reflection: Reflection | None = None) -> li
     """BSDFs of which no row tells all that they reflect: not diffuse, factored, or of single directions alone."""
     found: list[mi.BSDF] = []
     for mesh, material in zip(scene.meshes, scene.materials, strict=True):
-        factored = False
-        if isinstance(reflection, InOutFactors) and (number := reflection.material[mesh.vertices.start]) >= 0:
-            factored = not reflection.factors[number].followed
+        factored = isinstance(reflection, InOutFactors) and reflection.material[mesh.vertices.start] >= 0
         front = scene.materials[mesh.shape].bsdf
         if not (material.known_by_irradiance or factored or any(front is bsdf for bsdf in found)):
             found.append(front)

@@ -139,7 +139,7 @@ def glossy_indirect(
     Parameters
     ----------
     problem : Problem
-        Its reflection has the factors of ``direct``.
+        What it sends has the factors of ``direct``.
     direct : FactoredVisibility
     nodes : Nodes
         Vertices that gather unit-albedo light, others interpolate theirs; terms are gathered at all glossy ones.
@@ -150,8 +150,8 @@ def glossy_indirect(
     averaging : Averaging, optional
         Of the noise of unit-albedo rows.
     """
-    assert isinstance(problem.reflection, InOutFactors)
-    albedo, outgoing = _channels(problem.reflection)
+    assert isinstance(problem.sending, InOutFactors)
+    albedo, outgoing = _channels(problem.sending)
     rays_per_vertex, tolerance, seed = effort
     first, noise = _form_factors(problem, direct, nodes, outgoing, effort)
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))
@@ -159,7 +159,7 @@ def glossy_indirect(
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
     matrices = [[matrix, *after_mirrors] for matrix in first]
     of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
-    every, weights = np.hstack([albedo, of_terms]), problem.reflection.row_weights.mean(axis=1)
+    every, weights = np.hstack([albedo, of_terms]), problem.sending.row_weights.mean(axis=1)
     solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)
     solver.averaging = averaging
     return solver.indirect(direct, tolerance, specular), noise
@@ -169,10 +169,9 @@ def _form_factors(
     problem: Problem, direct: FactoredVisibility, nodes: Nodes, outgoing: Floats, effort: GatherEffort
 ) -> tuple[list[FactoredSparse], Noise]:
     """G_0 of each channel, and the noise of its rays, which are not kept: they take as much memory."""
-    assert isinstance(problem.reflection, InOutFactors)
     points = np.union1d(nodes.ids, direct.glossy)
     rays = gather_rays(problem, outgoing, effort.rays_per_vertex, effort.seed, points)
-    noise = rays.noise(direct, problem.reflection, problem.points, effort.seed)
+    noise = rays.noise(direct, problem, effort.seed)
     return gather_matrices(direct, rays, len(outgoing), nodes.ids), noise
 
 

@@ -19,6 +19,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.bits import BITS
+from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.factored_sparse import FactoredSparse
 from mi_sparse_prt.core.ragged import row_starts
 from mi_sparse_prt.core.random_keys import mix
@@ -26,7 +27,6 @@ from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.point_arrays import PointArrays
-from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.operators.column_blocks import combine_randomly
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -87,12 +87,16 @@ class GatherRays:
     out: Floats
     per_vertex: int
 
-    def noise(self, direct: FactoredVisibility, reflection: InOutFactors, points: Points, seed: int) -> Noise:
+    def noise(self, direct: FactoredVisibility, problem: Problem, seed: int) -> Noise:
         """What their randomness leaves of the first bounce, and in the matrix.
 
         From how far two halves of them differ, at some vertices and under random sums of columns, in one channel.
+        Vertices that no camera sees terms of do not count: others average what these send.
         """
-        order = np.argsort(mix(points.keys[self.points]), kind="stable")[:NOISE_VERTICES]
+        reflection = problem.sending
+        unseen = np.isin(self.points, np.setdiff1d(reflection.glossy, problem.reflection.glossy))
+        order = np.lexsort((mix(problem.points.keys[self.points]), unseen))[:NOISE_VERTICES]
+        order = order[~unseen[order]]
         own, terms = direct.material[self.points], direct.own_terms
         weights = np.where(own >= 0, 1 + terms[own], 0) * self.counts
         entries = np.cumsum((weights + self.entries(direct.material, terms))[order])
@@ -156,7 +160,7 @@ def gather_rays(
     Parameters
     ----------
     problem : Problem
-        With in-out factors.
+        Whose vertices send light by in-out factors.
     outgoing : (channels, materials, size, size, K) float32
         g_k.
     rays_per_vertex : int
@@ -165,10 +169,11 @@ def gather_rays(
     points : (n,) integers
         Vertices, ascending.
     """
-    assert isinstance(problem.reflection, InOutFactors)
+    assert isinstance(problem.sending, InOutFactors)
     surfaces = Surfaces(problem.scene, problem.max_depth)
     arrays, samples = PointArrays(problem.points), sobol(rays_per_vertex)
-    lobes = Lobes(problem.reflection, outgoing)
+    lobes = Lobes(problem.sending, outgoing)
+    senders = None if problem.sent is None else on_device(mi.UInt32, problem.sent.senders.astype(np.uint32))
     size = max(1, LANES // rays_per_vertex)
     blocks = []
     for a in range(0, len(points), size):
@@ -179,6 +184,8 @@ def gather_rays(
         dr.scatter(last, found.last, found.gaps)
         met = dr.compress(vertex < NOTHING)
         point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, first, last))
+        if senders is not None:
+            vertex = dr.gather(mi.UInt32, senders, vertex)
         row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
         blocks.append((
             np.bincount(row, minlength=len(some)),

@@ -10,6 +10,7 @@ import numpy as np
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reflection.reflection import Diffuse, Reflection
+from mi_sparse_prt.reflection.sent_light import SentLight
 from mi_sparse_prt.scene.scene import Scene
 
 MOST_APART = 8  # surfaces; of light that met more there is little, and telling it apart takes ever longer
@@ -35,6 +36,8 @@ class Problem:
     specular_apart : bool
         Light that comes from the sky by way of mirrors and glass alone is not part of the indirect light, but an
         operator of its own (``solvers.specular``).
+    sent : SentLight, optional
+        What vertices send to each other, where they have terms for that alone; as ``reflection`` if not given.
     """
 
     scene: Scene
@@ -44,6 +47,12 @@ class Problem:
     basis: str = "direction"
     max_depth: int = 5
     specular_apart: bool = False
+    sent: SentLight | None = None
+
+    @property
+    def sending(self) -> Reflection:
+        """What points send to each other."""
+        return self.reflection if self.sent is None else self.sent.reflection
 
     @property
     def points(self) -> Points:
@@ -65,7 +74,7 @@ class Problem:
         """The same at other points of the scene (normalised frame), which receive light and reflect all of it."""
         n = len(points)
         where = Measurement(points.keys, np.ones(n, np.float32), (), "points", normalised=points)
-        return replace(self, measurement=where, reflection=Diffuse(np.ones((n, 3), np.float32)))
+        return replace(self, measurement=where, reflection=Diffuse(np.ones((n, 3), np.float32)), sent=None)
 
     def on(self, resolution: int) -> Problem:
         """The same on a coarser cubemap, of which an element stands for all directions in its texel."""

@@ -8,7 +8,7 @@ is ``bent_light``.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -87,6 +87,10 @@ class SpecularLight:
     error: float
     rays: int
     seen: Bits | None = None
+
+    def take(self, rows: Ids) -> SpecularLight:
+        """Some rows alone."""
+        return replace(self, matrices=tuple(scipy.sparse.csr_array(m[rows]) for m in self.matrices))
 
     @cached_property
     def operator(self) -> SparseRows | ByDepth:

@@ -80,12 +80,12 @@ def term_rows(problem: Problem, seed: int, passed: Sparse | None = None) -> Term
     Parameters
     ----------
     problem : Problem
-        With in-out factors, at the vertices of its scene.
+        At the vertices of its scene, which send light by in-out factors.
     seed : int
     passed : (n, k * n_directions) sparse float32, optional
         Unit-albedo light that goes straight on, if there is any, as ``SpecularLight.matrices`` have it.
     """
-    reflection = problem.reflection
+    reflection = problem.sending
     assert isinstance(reflection, InOutFactors)
     ids, lobes = reflection.glossy, Lobes(reflection)
     bent_seeds = element_seeds(random_stream(seed, SPECULAR, 1), 2)

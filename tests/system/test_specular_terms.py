@@ -30,7 +30,7 @@ def glossy_problem() -> Problem:
         "gold": {"type": "sphere", "center": [0.5, 0.2, 0.2], "radius": 0.2, "bsdf": GOLD},
     }
     scene = build(0.4, **shapes)
-    reflection = chosen_reflection(scene, 0.05)
+    reflection = chosen_reflection(scene, 0.05).seen
     assert reflection.terms
     problem = problem_at(scene, prt.CubemapLighting(4), basis="texel")
     return replace(problem, reflection=reflection, specular_apart=True)
@@ -89,7 +89,7 @@ def test_light_through_a_half_open_sky():
         "bsdf": half,
     }
     scene = build(float("inf"), ground={**GROUND, "bsdf": SHINY}, sheet=sheet)
-    reflection = chosen_reflection(scene, 0.05)
+    reflection = chosen_reflection(scene, 0.05).seen
     problem = problem_at(scene, prt.CubemapLighting(16), basis="texel")
     problem = replace(problem, reflection=reflection, specular_apart=True)
     search = SpecularSearch(problem, 3, SpecularOptions(8, 8))

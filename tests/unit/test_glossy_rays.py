@@ -10,12 +10,11 @@ from numpy.testing import assert_allclose
 import mi_sparse_prt as prt
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.operators.factored_visibility import FactoredVisibility
-from mi_sparse_prt.reflection import surfaces
 from mi_sparse_prt.reflection.factor_tables import incident_tables, outgoing_tables
-from mi_sparse_prt.reflection.surfaces import chosen_reflection, vertex_reflection
+from mi_sparse_prt.reflection.surfaces import vertex_reflection
 from mi_sparse_prt.solvers.glossy_rays import gather_matrices, gather_rays
 
-METAL, BRUSHED = ({"type": "roughconductor", "material": "Cu", "alpha": alpha} for alpha in (0.2, 0.3))
+METAL = {"type": "roughconductor", "material": "Cu", "alpha": 0.2}
 
 
 def corner():
@@ -68,26 +67,6 @@ def test_terms_that_a_brdf_does_not_have_change_nothing():
     assert_allclose(sums[0], sums[1], rtol=1e-5, atol=1e-6)
     assert np.abs(sums[0][:, of_wall]).max() > 0.01
     assert sizes[0] < 0.9 * sizes[1]
-
-
-def test_metals_of_many_vertices_keep_few_factors(monkeypatch):
-    """
-    Expected: a metal that cameras follow keeps all that light between surfaces needs, or where 16 are not enough as
-        many as there is room for; where that is not three, none at all, which a warning says.
-    """
-
-    def chosen(bsdf, rows):
-        scene = build(0.6, floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": bsdf})
-        monkeypatch.setattr(surfaces, "ROWS", int(rows * scene.n_vertices))
-        return chosen_reflection(scene, 0.01)
-
-    with pytest.warns(prt.PrtWarning, match="cameras' rays go on"):
-        many, some, few, exact = (chosen(*of) for of in ((METAL, 99), (METAL, 5), (METAL, 3), (BRUSHED, 3)))
-    assert many.terms > 12 and 3 < some.terms <= 5 and few.terms == 3 and exact.terms > 8
-    assert all(found.factors[0].followed for found in (many, some, few, exact))
-    for metal in (METAL, BRUSHED):
-        with pytest.warns(prt.PrtWarning, match="'floor' .RoughConductor beside more than"):
-            assert chosen(metal, 2.9).terms == 0
 
 
 @pytest.mark.filterwarnings("ignore")
