@@ -178,7 +178,7 @@ def precompute(
         (seen, sent), settings = _reflection(scene, where, settings)
         apart = scene.specular and max_depth != 2
         problem = Problem(scene, lighting, where, seen, basis, max_depth, apart)
-        if sent is not None and max_depth != 2:
+        if where.kind == "vertices" and max_depth != 2:
             problem = replace(problem, sent=choose_senders(scene, problem.points, seen, sent))
         direct = DirectSolver(problem, strata, seed)
     return _Attempts(direct, settings, run).matrix()
@@ -197,7 +197,7 @@ class _Attempts:
             with run.clock.phase("specular"):
                 self._specular = SpecularSteps(self._problem, settings, run.seed, others)
             costs = None if costs is None else _beside_specular(costs, self._specular)
-        noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.sent)
+        noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.every)
         self._proposals = _proposals(direct, settings, costs, noise, run.clock)
         self._execution = Execution(direct, settings, self._dark is None, run, light)
 

@@ -28,6 +28,8 @@ from mi_sparse_prt.reconstruction.gather_noise import GatherNoise
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reflection.factor_tables import incident_tables
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.reflection.reflection import Reflection
+from mi_sparse_prt.reflection.sent_light import SentLight, rows_among
 from mi_sparse_prt.solvers.adaptive_strata import Strata, adaptive_visibility
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.glossy_radiosity import GatherEffort, glossy_indirect
@@ -53,7 +55,7 @@ class Execution:
         Whether there is indirect light.
     run : Run
     specular : SpecularLight, optional
-        Where it is an operator of its own; with rows of all terms that vertices send (``Problem.sending``).
+        Where it is an operator of its own; with rows for all terms that are seen or sent (``SentLight.every``).
     """
 
     def __init__(
@@ -70,7 +72,8 @@ class Execution:
         self._specular, self._specular_rays = specular, 0 if specular is None else specular.rays
         self._sent, sent = specular, self._problem.sent
         if specular is not None and sent is not None:
-            self._specular = specular.take(sent.rows_of(self._problem.reflection))
+            self._specular = specular.take(rows_among(self._problem.reflection, sent.every))
+            self._sent = specular.take(rows_among(sent.reflection, sent.every))
 
     def parts(self, plan: Plan) -> MethodResult:
         """The parts of the matrix, and an account of what was evaluated for them by this call."""
@@ -213,7 +216,7 @@ class Execution:
             effort = GatherEffort(plan.rays, plan.tolerance, seed)
             part, noise = glossy_indirect(problem, direct, nodes, effort, specular, averaging)
             if problem.sent is not None:
-                part = part.take(problem.sent.rows_of(problem.reflection))
+                part = _seen(part, problem.sent, problem.reflection)
         starts = len(np.union1d(nodes.ids, direct.glossy))
         rays = light.rays | {"gather": starts * plan.rays} | _rays_of(averaging)
         # the rank that leaves this out grows with the rays, too
@@ -254,6 +257,19 @@ class Execution:
         state = f"{self._problem.scene.hash} {self._settings.of(plan)} {plan}".encode()
         state += self._problem.points.keys.tobytes()
         return replace(self._run, state=hashlib.sha256(state).hexdigest()[:32])
+
+
+def _seen(
+    part: Gathered | GatheredByDepth, sent: SentLight, reflection: Reflection
+) -> Gathered | GatheredByDepth:
+    """Light of the rows of a matrix, from that of vertices and of senders' terms."""
+    if isinstance(part, GatheredByDepth):
+        depths = (
+            replace(term, left=tuple(sent.interpolated(left, reflection) for left in term.left))
+            for term in part.terms
+        )
+        return replace(part, terms=tuple(depths))
+    return replace(part, left=tuple(sent.interpolated(left, reflection) for left in part.left))
 
 
 def _rays_of(averaging: GatherNoise | None) -> dict[str, int]:

@@ -63,7 +63,7 @@ class LowRank(Operator):
     def _adjoint(self, y: Floats) -> Floats:
         return np.stack([b.T @ (a.T @ y[:, c]) for c, (a, b) in enumerate(self._factors)], axis=1)
 
-    def take(self, ids: Ids) -> Self:
+    def take(self, ids: Ids) -> LowRank:
         return replace(self, left=tuple(left[ids] for left in self.left))
 
     def arrays(self) -> dict[str, NDArray[Any] | Operator]:

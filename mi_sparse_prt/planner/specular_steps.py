@@ -11,6 +11,7 @@ from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
 from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN
 from mi_sparse_prt.reconstruction.specular_noise import SpecularNoise
+from mi_sparse_prt.reflection.sent_light import rows_among
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularLight, SpecularSearch
 from mi_sparse_prt.solvers.specular_terms import term_rows
@@ -44,8 +45,9 @@ class SpecularSteps:
             averaging = SpecularNoise(problem, seed)
         self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
         self._search.refine(AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0)
-        self._terms = term_rows(problem, seed, self._search.passed) if problem.sending.terms else None
-        self._problem = problem
+        self._problem, every = problem, None if problem.sent is None else problem.sent.every
+        has_terms = bool(every or problem.reflection.terms)
+        self._terms = term_rows(problem, seed, self._search.passed, every) if has_terms else None
 
     @property
     def seen(self) -> Bits | None:
@@ -55,12 +57,12 @@ class SpecularSteps:
     @property
     def light(self) -> SpecularLight:
         """As far as it was found, with rows for terms."""
-        sent, found = self._problem.sent, self.sent
-        return found if sent is None else found.take(sent.rows_of(self._problem.reflection))
+        sent, found = self._problem.sent, self.every
+        return found if sent is None else found.take(rows_among(self._problem.reflection, sent.every))
 
     @property
-    def sent(self) -> SpecularLight:
-        """The same, with rows for all terms that surfaces send to each other."""
+    def every(self) -> SpecularLight:
+        """The same, with rows for all terms that surfaces send to each other as well (``SentLight.every``)."""
         found = self._search.light()
         return found if self._terms is None else self._terms.after(found)
 

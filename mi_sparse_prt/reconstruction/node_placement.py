@@ -77,8 +77,17 @@ def choose_nodes(
     return Nodes(ids, scipy.sparse.csr_array((values, (vertices, number)), shape=(n, len(ids))))
 
 
-def nearest_nodes(scene: Scene, points: Points, members: Ids, most: int, small: int = FEW) -> Ids:
-    """Of some vertices about ``most``, evenly spread over each piece, and for each vertex the nearest of these.
+class Near(NamedTuple):
+    """Nodes near each of some vertices, the nearest first, (n, k), -1 for none, and their weights."""
+
+    nodes: Ids
+    weights: NDArray[np.float32]
+
+
+def nodes_among(
+    scene: Scene, points: Points, members: Ids, most: int, neighbours: int, small: int = FEW
+) -> Near:
+    """Some vertices of each piece as nodes of others, as ``choose_nodes``; all are their own if there are not so many.
 
     Parameters
     ----------
@@ -86,24 +95,21 @@ def nearest_nodes(scene: Scene, points: Points, members: Ids, most: int, small: 
         As for ``choose_nodes``.
     members : (n,) int64
         Ascending.
-    most, small : int
+    most, neighbours, small : int
         As for ``choose_nodes``.
-
-    Returns
-    -------
-    (n,) int64
-        Vertices; it may be one a little farther away where walls or other normals are between.
     """
+    found = Near(np.full((len(members), neighbours), -1), np.zeros((len(members), neighbours), np.float32))
+    found.nodes[:, 0], found.weights[:, 0] = members, 1
     if len(members) <= most:
-        return members
-    piece = scene.pieces[members]
-    wanted, found = _wanted(np.bincount(piece), most, small), members.copy()
-    walls = Walls(scene, points)
+        return found
+    piece, walls = scene.pieces[members], Walls(scene, points)
+    wanted = _wanted(np.bincount(piece), most, small)
     for one in np.unique(piece):
         own = np.flatnonzero(piece == one)
         if wanted[one] < len(own):
-            near = _between_nodes(scene, points, walls, members[own], int(wanted[one]), 1)
-            found[np.searchsorted(members, near.vertices)] = near.nodes
+            near = _near_nodes(scene, points, walls, members[own], int(wanted[one]), neighbours)
+            some = own[near.nodes[:, 0] >= 0]  # others see no node, and are their own
+            found.nodes[some], found.weights[some] = (part[near.nodes[:, 0] >= 0] for part in near)
     return found
 
 
@@ -118,6 +124,14 @@ def _between_nodes(
     scene: Scene, points: Points, walls: Walls, members: Ids, wanted: int, neighbours: int
 ) -> _Weights:
     """Weights of nodes for the vertices of a piece."""
+    near = _near_nodes(scene, points, walls, members, wanted, neighbours)
+    vertex, place = np.nonzero(near.nodes >= 0)
+    return _Weights(members[vertex], near.nodes[vertex, place], near.weights[vertex, place])
+
+
+def _near_nodes(
+    scene: Scene, points: Points, walls: Walls, members: Ids, wanted: int, neighbours: int
+) -> Near:
     p, n = scene.normalised_positions[members], scene.normals[members]
     order = morton_order(p, points.keys[members])
     # the middle one of each of so many stretches along the curve
@@ -133,5 +147,4 @@ def _between_nodes(
         nodes = np.concatenate([nodes, alone])
         near = nearest(nodes)
     weights = linear_weights(near, p, n, p[nodes], n[nodes])
-    vertex, place = np.nonzero(near.ids >= 0)
-    return _Weights(members[vertex], members[nodes[near.ids[vertex, place]]], weights[vertex, place])
+    return Near(np.where(near.ids >= 0, members[nodes][near.ids], -1), weights)

@@ -106,5 +106,5 @@ def orthogonalise(along: Floats, normals: Floats) -> Floats:
 
 
 def frames(tangents: Floats, normals: Floats) -> Floats:
-    """Rotations (n, 3, 3) from the world to frames: their rows are tangent, normal x tangent and normal."""
-    return np.stack([tangents, np.cross(normals, tangents), normals], axis=1).astype(np.float32)
+    """Rotations (..., 3, 3) from the world to frames: their rows are tangent, normal x tangent and normal."""
+    return np.stack([tangents, np.cross(normals, tangents), normals], axis=-2).astype(np.float32)

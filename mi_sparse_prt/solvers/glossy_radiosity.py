@@ -159,7 +159,7 @@ def glossy_indirect(
     after_mirrors = _after_mirrors(problem, nodes.ids, (len(rows), direct.shape[0]), rays_per_vertex, seed)
     matrices = [[matrix, *after_mirrors] for matrix in first]
     of_terms = np.ones((len(albedo), direct.shape[0] - albedo.shape[1]), np.float32)
-    every, weights = np.hstack([albedo, of_terms]), problem.sending.row_weights.mean(axis=1)
+    every, weights = np.hstack([albedo, of_terms]), _row_weights(problem, problem.sending, len(nodes))
     solver = GlossyGather(matrices, every, problem, direct, rows, weights, seed)
     solver.averaging = averaging
     return solver.indirect(direct, tolerance, specular), noise
@@ -173,6 +173,16 @@ def _form_factors(
     rays = gather_rays(problem, outgoing, effort.rays_per_vertex, effort.seed, points)
     noise = rays.noise(direct, problem, effort.seed)
     return gather_matrices(direct, rays, len(outgoing), nodes.ids), noise
+
+
+def _row_weights(problem: Problem, sending: InOutFactors, nodes: int) -> Floats:
+    """What errors of rows count by: radiance, and for how many vertices a row stands."""
+    weights, n = sending.row_weights.mean(axis=1), len(sending.albedo)
+    if problem.sent is not None:
+        stands_for = np.bincount(problem.sent.senders[problem.reflection.glossy], minlength=n)
+        share = np.maximum(stands_for[sending.glossy], 1) * nodes / n
+        weights[n:] *= np.repeat(np.sqrt(share), sending.terms)
+    return weights
 
 
 def _after_mirrors(

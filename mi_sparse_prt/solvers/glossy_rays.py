@@ -69,12 +69,14 @@ class GatherRays:
         Of their rays that meet a surface.
     seen : (m,) int32
         The vertex that each of these meets.
+    sender : (m,) int32
+        The one whose terms it finds there.
     half : (m,) bool
         To which of two halves of the rays it belongs.
     into : (rays of glossy vertices, K) float32
         Weights in the terms of its own vertex.
     out : (rays that meet glossy vertices, channels * K) float32
-        g_k of ``seen`` towards the ray's origin.
+        g_k of ``sender`` towards the ray's origin; of rays whose senders are glossy.
     per_vertex : int
         Rays, those that meet nothing among them.
     """
@@ -82,6 +84,7 @@ class GatherRays:
     points: NDArray[np.int64]
     counts: NDArray[np.int64]
     seen: NDArray[np.int32]
+    sender: NDArray[np.int32]
     half: NDArray[np.bool_]
     into: Floats
     out: Floats
@@ -125,7 +128,7 @@ class GatherRays:
 
     def entries(self, material: NDArray[np.integer], terms: NDArray[np.int64]) -> NDArray[np.int64]:
         """How many numbers (n,) the rays of each point find: what they meet, and the terms (materials,) of that."""
-        met = material[self.seen]
+        met = material[self.sender]
         of_terms = np.cumsum(np.where(met >= 0, terms[met], 0))
         return self.counts + np.diff(np.concatenate([[0], of_terms])[row_starts(self.counts)])
 
@@ -140,9 +143,10 @@ class GatherRays:
             self.points[which],
             np.bincount(of, minlength=len(self.points))[which],
             self.seen[kept],
+            self.sender[kept],
             self.half[kept],
             self.into[kept[glossy]],
-            self.out[kept[material[self.seen] >= 0]],
+            self.out[kept[material[self.sender] >= 0]],
             self.per_vertex // 2,
         )
 
@@ -184,18 +188,18 @@ def gather_rays(
         dr.scatter(last, found.last, found.gaps)
         met = dr.compress(vertex < NOTHING)
         point, vertex, d, last = (dr.gather(type(x), x, met) for x in (point, vertex, first, last))
-        if senders is not None:
-            vertex = dr.gather(mi.UInt32, senders, vertex)
+        sender = vertex if senders is None else dr.gather(mi.UInt32, senders, vertex)
         row, number = np.divmod(met.numpy(), np.uint32(rays_per_vertex))
         blocks.append((
             np.bincount(row, minlength=len(some)),
             mi.Int32(vertex).numpy(),
+            mi.Int32(sender).numpy(),
             np.bitwise_count(number) % 2 == 1,  # rays are in Morton's order, so that this is a checkerboard
             _of_glossy(lobes, lobes.incident, point, d),
-            _of_glossy(lobes, lobes.outgoing, vertex, -last),
+            _of_glossy(lobes, lobes.outgoing, sender, -last),
         ))  # fmt: skip
-    counts, seen, half, into, out = (np.concatenate(x) for x in zip(*blocks, strict=True))
-    return GatherRays(points, counts, seen, half, into, out, rays_per_vertex)
+    counts, seen, sender, half, into, out = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    return GatherRays(points, counts, seen, sender, half, into, out, rays_per_vertex)
 
 
 def _of_glossy(lobes: Lobes, look_up: LookUp, vertex: mi.UInt32, direction: mi.Vector3f) -> Floats:
@@ -247,9 +251,9 @@ def _met(
     direct: FactoredVisibility, rays: GatherRays, some: NDArray[np.int64], channels: int
 ) -> list[scipy.sparse.csr_array]:
     """What some rays find (rays, n), in each channel: the light of a vertex and, if it is glossy, of all its terms."""
-    number = _numbers(direct.glossy, len(direct.material))[rays.seen]
+    number = _numbers(direct.glossy, len(direct.material))[rays.sender]
     shiny = np.cumsum(number >= 0) - 1  # its place among rays that meet such
-    counts = np.append(direct.own_terms, 0)[direct.material[rays.seen]]  # of terms
+    counts = np.append(direct.own_terms, 0)[direct.material[rays.sender]]  # of terms
     starts = row_starts(1 + counts[some])
     columns, found = np.empty(starts[-1], np.int32), list[scipy.sparse.csr_array]()
     out = rays.out.reshape(len(rays.out), rays.out.shape[1] // direct.terms, direct.terms)

@@ -18,7 +18,7 @@ columns and rows (``first_bounce``). Later bounces are those of its singular vec
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -104,9 +104,6 @@ class GatheredByDepth(ByDepth):
 
     terms: tuple[LowRank, ...]
     left_out: float
-
-    def take(self, ids: NDArray[np.integer]) -> GatheredByDepth:
-        return replace(self, terms=tuple(term.take(ids) for term in self.terms))
 
     @property
     def ranks(self) -> tuple[int, ...]:

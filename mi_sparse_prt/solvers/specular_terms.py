@@ -71,7 +71,9 @@ class TermRows(NamedTuple):
         return replace(specular, matrices=matrices, rays=specular.rays + self.rays)
 
 
-def term_rows(problem: Problem, seed: int, passed: Sparse | None = None) -> TermRows:
+def term_rows(
+    problem: Problem, seed: int, passed: Sparse | None = None, every: InOutFactors | None = None
+) -> TermRows:
     """Specular light as the terms of glossy vertices receive it.
 
     Light by way of mirrors and glass is weighted by incident factors in the direction of each ray, and is noisier than
@@ -80,12 +82,14 @@ def term_rows(problem: Problem, seed: int, passed: Sparse | None = None) -> Term
     Parameters
     ----------
     problem : Problem
-        At the vertices of its scene, which send light by in-out factors.
+        At the vertices of its scene.
     seed : int
     passed : (n, k * n_directions) sparse float32, optional
         Unit-albedo light that goes straight on, if there is any, as ``SpecularLight.matrices`` have it.
+    every : InOutFactors, optional
+        Whose terms are asked for; the problem's if not given.
     """
-    reflection = problem.sending
+    reflection = every or problem.reflection
     assert isinstance(reflection, InOutFactors)
     ids, lobes = reflection.glossy, Lobes(reflection)
     bent_seeds = element_seeds(random_stream(seed, SPECULAR, 1), 2)

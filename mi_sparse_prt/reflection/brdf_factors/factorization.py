@@ -22,6 +22,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -32,8 +34,24 @@ from mi_sparse_prt.reflection.brdf_factors.direction_grid import DirectionGrid, 
 from mi_sparse_prt.reflection.brdf_factors.isotropic import factor_waves, values_by_turn
 
 MOST_TERMS = 16
+WHOLE = 0.1  # of a term's norm may be missing where frames turn: half of a pair misses all of it
 LIGHT_ORDER = 16  # of harmonics by which light is not white noise
 LIGHT_FALL = 2.0  # power of light per harmonic of degree l is (l + 1)^-LIGHT_FALL, see above
+
+
+class Turning(NamedTuple):
+    """f_k where the azimuth is larger by d: ``cos(m_k d) f_k + sin(m_k d) sum_l P_kl f_l``.
+
+    Attributes
+    ----------
+    waves : (K,) int64
+        m.
+    partners : (K, K) float64
+        P.
+    """
+
+    waves: NDArray[np.int64]
+    partners: Doubles
 
 
 @dataclass(frozen=True)
@@ -92,6 +110,27 @@ class BrdfFactors:
         if not chosen:
             return self.first(terms)
         return replace(self, incident=self.incident[chosen], outgoing=self.outgoing[chosen])
+
+    @cached_property
+    def turning(self) -> Turning | None:
+        """What terms become in a frame turned about its normal; None of anisotropic BRDFs, and of half pairs."""
+        waves = self._waves()
+        if waves is None:
+            return None
+        m, grid = np.array(waves), (self.terms, self.grid.heights, self.grid.azimuths)
+        spectra = np.fft.rfft(self.incident.astype(np.float64).reshape(grid), axis=2)
+        quarters = np.zeros_like(spectra)  # turned by a quarter of each one's wave
+        each = np.arange(self.terms)
+        quarters[each, :, m] = np.where(m[:, None] > 0, 1j, 0) * spectra[each, :, m]
+        turned = np.fft.irfft(quarters, grid[2], axis=2).reshape(self.terms, -1)
+        partners = np.zeros((self.terms, self.terms))
+        for wave in set(waves) - {0}:
+            own = m == wave
+            partners[np.ix_(own, own)] = np.linalg.lstsq(self.incident[own].T, turned[own].T, rcond=1e-3)[0].T
+        missing = np.linalg.norm(turned - partners @ self.incident, axis=1)
+        if (missing > WHOLE * np.linalg.norm(self.incident, axis=1)).any():
+            return None
+        return Turning(m, partners)
 
     def _waves(self) -> list[int] | None:
         """How often each term goes around, m; None if one has several waves."""
