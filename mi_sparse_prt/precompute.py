@@ -30,7 +30,7 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
 from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted
-from mi_sparse_prt.planner.forecast import Forecast, forecast
+from mi_sparse_prt.planner.forecast import Forecast, fits, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.specular_steps import SpecularSteps
 from mi_sparse_prt.reconstruction.senders import choose_senders
@@ -189,7 +189,7 @@ class _Attempts:
 
     def __init__(self, direct: DirectSolver, settings: Settings, run: Run) -> None:
         self._direct, self._problem, self._settings, self._run = direct, direct.problem, settings, run
-        self._dark = _no_indirect(direct.problem, settings, run.clock)
+        self._dark, self._left_out = _no_indirect(direct.problem, settings, run.clock), list[str]()
         settings, costs = _measured(direct, settings, self._dark is None, run.clock)
         self._specular = None
         if self._dark is None and self._problem.specular_apart:
@@ -219,7 +219,7 @@ class _Attempts:
         _warn_if_missed(error, self._settings, self._proposals.too_long)
         _warn_of_specular_noise(parts.specular, error, self._settings)
         transport.report.update(
-            _account(parts, problem, _skipped(problem.scene, self._dark, error))
+            _account(parts, problem, [*_skipped(problem.scene, self._dark, error), *self._left_out])
             | {"estimated_error": error.report(), "plans": self._proposals.report()}
             | {"forecast": expected._asdict(), "plan": plan.report()}
             | _costs(transport, run.clock)
@@ -231,6 +231,14 @@ class _Attempts:
         with self._run.clock.phase("pilot"):
             proposals, indirect = self._proposals, self._dark is None
             return forecast(self._direct, self._settings, proposals.plan, indirect, proposals.seconds)
+
+    def _fits(self, plan: Plan) -> bool:
+        """Whether there is memory for one more attempt; if not, the report will say so."""
+        with self._run.clock.phase("plan"):
+            found = fits(self._direct, self._settings, plan, self._dark is None)
+        if not found:
+            self._left_out.append(f"a next attempt, {plan}: more memory than is free")
+        return found
 
     def _direct_light(self) -> list[MethodResult]:
         """Direct light that a choice between plans depends on, found and judged first; an empty list if none does."""
@@ -260,6 +268,8 @@ class _Attempts:
                 break
             of_rays = attempts[-1].radiosity.get("error_of_rays", math.inf)
             if not proposals.after(found, self._run.clock.report()["total"], of_rays):
+                break
+            if not self._fits(proposals.plan):
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))

@@ -72,7 +72,7 @@ def forecast(
     """
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
     paths = indirect_solver(direct.problem, settings.of(plan))
-    needed, available = peak_bytes(direct, paths, plan, indirect), psutil.virtual_memory().available
+    needed, available = peak_bytes(direct, paths, plan, indirect), _available()
     if needed > available:
         raise PrtError(
             f"the matrix needs {needed / 1e9:.1f} GB but {available / 1e9:.1f} GB are free; "
@@ -83,3 +83,13 @@ def forecast(
         row += more.paths * seconds_per_row(paths) if more.paths else 0.0
         seconds = len(direct.points) * row
     return Forecast(seconds, float(needed))
+
+
+def fits(direct: DirectSolver, settings: Settings, plan: Plan, indirect: bool) -> bool:
+    """Whether there is memory for one more plan, beside what is known of those before; arguments as of ``forecast``."""
+    paths = indirect_solver(direct.problem, settings.of(plan))
+    return peak_bytes(direct, paths, plan, indirect) <= _available()
+
+
+def _available() -> int:
+    return int(psutil.virtual_memory().available)

@@ -53,6 +53,21 @@ def test_the_peak_is_forecast(plan):
     assert 1 / 1.5 < forecast / peak < 1.5
 
 
+def test_next_attempts_have_room(monkeypatch):
+    """
+    Rationale: each attempt of a target error has more rays than the one before, and form factors of all of them.
+    Expected: with memory for the first one alone, its matrix is the result; the report says what was left out.
+    """
+    scene, lighting = build(0.1, **still_life(COLOURS)), prt.CubemapLighting(8)
+    first = prt.precompute(scene, lighting, "gather", progress=False).report
+    room = SimpleNamespace(available=1.01 * first["forecast"]["bytes"])
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: room)
+    with pytest.warns(prt.PrtWarning, match="was not met"):
+        found = prt.precompute(scene, lighting, "gather", target_error=1e-4, progress=False)
+    assert found.report["plan"] == first["plan"]
+    assert any("a next attempt" in left and "more memory" in left for left in found.report["skipped"])
+
+
 def test_what_does_not_fit_is_refused(monkeypatch):
     """Rationale: the matrix itself would fit; what it is made with would not.
     Expected: an error before anything is traced for it, that says how much is needed and what to lower.

@@ -674,7 +674,10 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     module = importlib.import_module("mi_sparse_prt.planner.specular_steps")
     monkeypatch.setattr(module, "SpecularSearch", Search)
     problem = SimpleNamespace(
-        reflection=SimpleNamespace(terms=0), scene=SimpleNamespace(bends_light=False), at_vertices=None
+        reflection=SimpleNamespace(terms=0),
+        scene=SimpleNamespace(bends_light=False),
+        at_vertices=None,
+        sent=None,
     )
     cases = (
         (0.05, 0.3, 0.1453),
@@ -716,7 +719,10 @@ def test_noise_of_specular_light_alone(monkeypatch):
         importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
     )
     problem = SimpleNamespace(
-        reflection=SimpleNamespace(terms=0), scene=SimpleNamespace(bends_light=False), at_vertices=None
+        reflection=SimpleNamespace(terms=0),
+        scene=SimpleNamespace(bends_light=False),
+        at_vertices=None,
+        sent=None,
     )
     steps = SpecularSteps(problem, Settings(8, target_error=0.02, specular_error=0.1), 0)
     assert steps.error == 0 and not steps.done
