@@ -30,6 +30,7 @@ from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 ATTEMPTS = 4
+FIRST_SHARE = 0.8  # of a target, for direct light of a first attempt: 0.6 of it is left to the rest
 TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
 
 
@@ -71,7 +72,7 @@ class RefinementSchedule:
     ) -> None:
         first, *self._others = plans
         self._shares, self._aim = shares, MARGIN * (target or 0.0)
-        self.plan = self._with_shares(first)
+        self.plan = first if shares is None else shares.of(first, FIRST_SHARE)
         self._limit, self._started, self._error = limit, started, math.inf
         self._before: Plan | None = None
 

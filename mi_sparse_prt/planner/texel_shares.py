@@ -18,6 +18,7 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 POINTS = 1024  # of a pilot, all together
 TEXELS = 16
+HALF = math.sqrt(0.5)  # of a target error, whose square is half of its own
 
 
 class TexelShares:
@@ -39,14 +40,20 @@ class TexelShares:
         self._direct, self._settings = direct, settings
         self._costs: dict[float, DirectCost] = {}  # by what was aimed at
 
-    def of(self, plan: Plan) -> Plan:
+    def of(self, plan: Plan, share: float = HALF) -> Plan:
         """The plan, with adaptive strata if edges miss what a target has room for, or its tolerance, and these do less.
 
         Clearly less: lobes that change within texels have errors that no strata take away.
+
+        Parameters
+        ----------
+        plan : Plan
+        share : float
+            Of the target error, which direct light may have.
         """
         settings = self._settings
         target = settings.target_error
-        aim = plan.tolerance if target is None else MARGIN * target / math.sqrt(2)  # half of its square
+        aim = plan.tolerance if target is None else MARGIN * share * target
         if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= aim:
             return plan
         if aim not in self._costs:

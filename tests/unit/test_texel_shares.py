@@ -11,8 +11,8 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.candidates import RefinementSchedule
-from mi_sparse_prt.planner.texel_shares import TexelShares
+from mi_sparse_prt.planner.candidates import FIRST_SHARE, RefinementSchedule
+from mi_sparse_prt.planner.texel_shares import HALF, TexelShares
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -76,6 +76,8 @@ def test_others_keep_edges():
     scene = slatted(3.0, METAL)
     direct, plan = DirectSolver(problem_at(scene, LIGHTING, basis="texel")), Plan("edges", "gather", 64, 0.06)
     assert TexelShares(direct, settings()).of(plan) == plan
+    for share, direct_is in ((1e3, "edges"), (1.0, "adaptive")):
+        assert TexelShares(direct, settings(target_error=0.004)).of(plan, share).direct == direct_is
     strict = TexelShares(direct, settings(target_error=0.004)).of(plan)
     assert strict.direct == "adaptive" and strict.rays == plan.rays
     assert TexelShares(direct, settings(target_error=0.004, max_seconds=1e-3)).of(plan) == plan
@@ -86,11 +88,14 @@ def test_others_keep_edges():
 def test_finer_direct_light_may_be_worth_it_alone():
     """
     Rationale: a schedule ends where rays would not help; strata help direct light.
-    Expected: with an error of direct light, a plan of adaptive strata follows one of edges, and none like it.
+    Expected: with an error of direct light, a plan of adaptive strata follows one of edges, and none like it. The first
+        plan may spend 0.8 of the target on direct light, later ones half of its square.
     """
+    asked = []
 
     class Shares:
-        def of(self, plan: Plan) -> Plan:
+        def of(self, plan: Plan, share: float = HALF) -> Plan:
+            asked.append(share)
             return (
                 plan
                 if plan.rays == 64
@@ -104,6 +109,7 @@ def test_finer_direct_light_may_be_worth_it_alone():
     assert schedule.plan == plans[0]
     assert schedule.after(found, 4.0) and (schedule.plan.direct, schedule.plan.rays) == ("adaptive", 256)
     assert not schedule.after(found, 8.0)
+    assert asked[0] == FIRST_SHARE == 0.8 and set(asked[1:]) == {HALF}
 
 
 def problem_of(scene: Scene):
