@@ -82,7 +82,8 @@ def _direct(direct: DirectSolver, plan: Plan) -> tuple[float, float]:
 def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     """Bytes of form factors and of the low rank that is made with them."""
     n, texels, reflection = len(direct.points), direct.lighting.n_directions, direct.problem.sending
-    terms, rows, nodes = reflection.terms, reflection.row_count, node_count(direct.problem.scene)
+    terms, nodes = reflection.terms, node_count(direct.problem.scene)
+    rows = reflection.row_count * max(1, direct.problem.depths_apart)  # each depth has rows of its own
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
     basis = 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)

@@ -102,7 +102,7 @@ def nodes_among(
     found.nodes[:, 0], found.weights[:, 0] = members, 1
     if len(members) <= most:
         return found
-    piece, walls = scene.pieces[members], Walls(scene, points)
+    piece, walls = scene.pieces[members], Walls(scene, points, gaps=True)
     wanted = _wanted(np.bincount(piece), most, small)
     for one in np.unique(piece):
         own = np.flatnonzero(piece == one)

@@ -26,6 +26,8 @@ class Walls:
     ----------
     scene : Scene
     points : Points
+    gaps : bool
+        Whether a straight way is one as well: points in a gap behind a door are then on one side.
 
     Notes
     -----
@@ -34,8 +36,8 @@ class Walls:
     What is lower than that is no wall: light comes over it.
     """
 
-    def __init__(self, scene: Scene, points: Points) -> None:
-        self._scene, self._points = scene.unsplit, PointArrays(points)
+    def __init__(self, scene: Scene, points: Points, gaps: bool = False) -> None:
+        self._scene, self._points, self._gaps = scene.unsplit, PointArrays(points), gaps
 
     def between(self, first: Ids, second: Ids) -> NDArray[np.bool_]:
         """Whether something stands between points (m,) and points (m,) that face the same way, (m,) bool."""
@@ -45,7 +47,8 @@ class Walls:
             p, n = self._above(on_device(mi.UInt32, first[part].astype(np.uint32)))
             q, m = self._above(on_device(mi.UInt32, second[part].astype(np.uint32)))
             middle = 0.5 * (p + q) + 0.5 * dr.norm(p - q) * dr.normalize(n + m)
-            found[part] = (self._blocked(p, middle) | self._blocked(q, middle)).numpy()
+            blocked = self._blocked(p, middle) | self._blocked(q, middle)
+            found[part] = (blocked & self._blocked(p, q) if self._gaps else blocked).numpy()
         return found
 
     def leave_fewer(self, least: int, ids: Ids, near: NDArray[np.int32]) -> NDArray[np.bool_]:

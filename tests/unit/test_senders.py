@@ -95,6 +95,34 @@ def test_senders_are_nearby_and_face_the_same_way(monkeypatch):
     assert np.array_equal(whole.reflection.glossy, np.sort(np.r_[seen.glossy, metals]))
 
 
+def test_senders_are_on_this_side_of_walls(monkeypatch):
+    """
+    Rationale: a metal floor lies below a thin wall, and below a board that floats above a part of it.
+    Expected: no vertex has its sender on the other side of the wall; the board leaves about as few as asked for, since
+        vertices below it know each other.
+    """
+    slab = T().translate([0, 0.5, 0]).scale([0.01, 0.52, 1.2])
+    scene = build(
+        0.04,
+        floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": METAL},
+        wall={"type": "cube", "to_world": slab, "bsdf": diffuse(0.5, 0.5, 0.5)},
+        board={
+            "type": "cube",
+            "to_world": T().translate([0.5, 0.03, 0]).scale([0.4, 0.01, 0.8]),
+            "bsdf": diffuse(0.5, 0.5, 0.5),
+        },
+    )
+    seen, sent = chosen(scene)
+    floor = scene.meshes[0].vertices
+    count = floor.stop - floor.start
+    monkeypatch.setattr(senders, "ROWS", count * sent.terms // 10)
+    found = choose_senders(scene, vertex_points(scene), seen, sent)
+    x, own = scene.positions[floor, 0], found.senders[floor]
+    apart = np.abs(x) > 0.02
+    assert np.all(np.sign(x[apart]) == np.sign(scene.positions[own[apart], 0]))
+    assert count / 11 < len(found.reflection.glossy) < count / 6
+
+
 def test_rows_of_the_matrix_among_those_that_are_sent():
     """Expected: unit-albedo rows are the same; the terms of each plastic vertex are its first ones there."""
     scene = corner()
