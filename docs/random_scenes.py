@@ -1,7 +1,7 @@
 """Scenes that nobody has chosen: rooms, product shots, landscapes and courtyards, drawn at random.
 
     python docs/random_scenes.py FOLDER [--first 0] [--count 8]
-    mi-sparse-prt benchmark --zoo FOLDER --figures FOLDER/sheet --json FOLDER/zoo.json
+    mi-sparse-prt benchmark FOLDER --zoo --figures FOLDER/sheet --json FOLDER/zoo.json
 
 Scene k is the same whenever it is made, and k mod 4 is its kind. What is changed in the code is shown on numbers that
 no one has seen before.
