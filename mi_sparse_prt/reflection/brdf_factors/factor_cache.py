@@ -101,9 +101,8 @@ def factors_for_images(
     bound: float,
     folder: Path | None = None,
     options: FactorOptions | None = None,
-    most: int = MOST_TERMS,
 ) -> tuple[BrdfFactors, float]:
-    """The fewest factors that meet an error of images, or as many as there may be; none without its partner.
+    """The fewest factors that meet an error of images, or 16; none without its partner.
 
     Parameters
     ----------
@@ -111,8 +110,6 @@ def factors_for_images(
         As for ``factors_of``.
     bound : float
         Relative L2 error of the radiance that the surface reflects, ``FactorError.lit``.
-    most : int
-        Factors, 16 or fewer.
 
     Returns
     -------
@@ -127,9 +124,9 @@ def factors_for_images(
     """
     factors, error = _find_or_make(bsdf, name, folder or cache_folder() / "brdf", options or FactorOptions())
     good = np.flatnonzero(error.lit <= bound)
-    enough = int(good[0]) + 1 if len(good) else most
-    whole = (factors.complete(terms) for terms in range(enough, most))
-    found = next((some for some in whole if some.terms >= enough), factors.complete(most))
+    enough = int(good[0]) + 1 if len(good) else MOST_TERMS
+    whole = (factors.complete(terms) for terms in range(enough, MOST_TERMS))
+    found = next((some for some in whole if some.terms >= enough), factors.complete(MOST_TERMS))
     return found, float(error.lit[found.terms - 1])
 
 
