@@ -270,6 +270,7 @@ class _Attempts:
             if not proposals.after(found, self._run.clock.report()["total"], of_rays):
                 break
             if not self._fits(proposals.plan):
+                proposals.leave()
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))

@@ -118,6 +118,9 @@ class RefinementSchedule:
     def _with_shares(self, plan: Plan) -> Plan:
         return plan if self._shares is None else self._shares.of(plan)
 
+    def leave(self) -> None:
+        """Do not carry out the present plan, after others; no report names it."""
+
     def weighed(self, found: HeldOutError) -> HeldOutError:
         """The error of the present plan: what was found, as nothing was predicted."""
         return found
@@ -227,6 +230,11 @@ class CandidatePlans:
         self._plans.append(next_one)
         self._tried.append(next_one)
         return True
+
+    def leave(self) -> None:
+        """Do not carry out the present plan, after others."""
+        self._best = self._tried[-2]
+        self._tried.pop()
 
     def weighed(self, found: HeldOutError) -> HeldOutError:
         """The error of the present plan, as far as it is known: see ``choice.weighed``."""

@@ -10,7 +10,7 @@ from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.node_placement import nodes_among
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
-from mi_sparse_prt.reflection.sent_light import SentLight
+from mi_sparse_prt.reflection.sent_light import SentLight, azimuths
 from mi_sparse_prt.scene.scene import Scene
 
 # Rows of terms that a matrix has, and of others, about: with twice as many, errors of three scenes were the same or a
@@ -55,6 +55,5 @@ def choose_senders(
     listed = nearest == vertices
     reflection = replace(every, material=np.where(listed, every.material, -1))
     listed[shown] = True
-    return SentLight(
-        reflection, replace(every, material=np.where(listed, every.material, -1)), nearest, near, weights
-    )
+    whole = replace(every, material=np.where(listed, every.material, -1))
+    return SentLight(reflection, whole, nearest, near, weights, azimuths(every, shown, near))

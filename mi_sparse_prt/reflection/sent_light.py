@@ -35,7 +35,8 @@ class SentLight:
         Of each vertex the one whose terms are sent in place of its own; itself, if it is a sender or diffuse.
     near : (n_g, k) int64
         Senders between which light of a glossy vertex of the matrix is interpolated that other surfaces send; -1: none.
-    weights : (n_g, k) float32
+    weights, angles : (n_g, k) float32
+        Of these; azimuths of their tangents in the frame of the vertex (``azimuths``).
     """
 
     reflection: InOutFactors
@@ -43,6 +44,7 @@ class SentLight:
     senders: NDArray[np.int64]
     near: NDArray[np.int64]
     weights: Floats
+    angles: Floats
 
     def interpolated(self, light: Floats, seen: Reflection) -> Floats:
         """Light (rows, m) of the rows of a matrix whose reflection is ``seen``, from that of the rows here."""
@@ -55,21 +57,21 @@ class SentLight:
         result = np.empty((seen.row_count, light.shape[1]), np.float32)
         result[:n] = light[:n]
         own = result[n:].reshape(-1, seen.terms, light.shape[1])
-        turned = number, self.weights, self._angles(seen), seen.material[seen.glossy], waves, partners
+        turned = number, self.weights, self.angles, seen.material[seen.glossy], waves, partners
         run_in_parts(_interpolated, len(own), turned, terms, own)
         return result
 
-    def _angles(self, seen: InOutFactors) -> Floats:
-        """Azimuths (n_g, k) of the tangents of near senders in the frames of vertices."""
-        here = frames(seen.tangents[seen.glossy], seen.normals[seen.glossy])[:, None]
-        there = frames(seen.tangents[self.near], seen.normals[self.near])  # anything where there is none
-        tangent, normal = there[:, :, 0], there[:, :, 2]
-        axis = np.cross(normal, here[:, :, 2])  # carried from normal to normal by the least turn
-        cosine = (normal * here[:, :, 2]).sum(axis=2, keepdims=True)
-        along = (axis * tangent).sum(axis=2, keepdims=True) / np.maximum(1 + cosine, 1e-3)
-        carried = cosine * tangent + np.cross(axis, tangent) + along * axis
-        x, y = ((carried * here[:, :, k]).sum(axis=2) for k in range(2))
-        return np.arctan2(y, x).astype(np.float32)
+
+def azimuths(reflection: InOutFactors, vertices: NDArray[np.int64], near: NDArray[np.int64]) -> Floats:
+    """Azimuths (n, k) of the tangents of near vertices (n, k) in the frames of vertices (n,); any for -1."""
+    here, there = (frames(reflection.tangents[v], reflection.normals[v]) for v in (vertices[:, None], near))
+    tangent, normal = there[:, :, 0], there[:, :, 2]
+    axis = np.cross(normal, here[:, :, 2])  # carried from normal to normal by the least turn
+    cosine = (normal * here[:, :, 2]).sum(axis=2, keepdims=True)
+    along = (axis * tangent).sum(axis=2, keepdims=True) / np.maximum(1 + cosine, 1e-3)
+    carried = cosine * tangent + np.cross(axis, tangent) + along * axis
+    x, y = ((carried * here[:, :, k]).sum(axis=2) for k in range(2))
+    return np.arctan2(y, x).astype(np.float32)
 
 
 def rows_among(some: Reflection, every: Reflection) -> NDArray[np.int64]:
@@ -81,7 +83,7 @@ def rows_among(some: Reflection, every: Reflection) -> NDArray[np.int64]:
 
 
 def _turnings(seen: InOutFactors) -> tuple[Floats, Floats]:
-    """M (BRDFs, K) and P (BRDFs, K, K), 0 where terms do not turn; those have senders of their own."""
+    """Waves m (BRDFs, K) and partners P (BRDFs, K, K), 0 where terms do not turn; those have senders of their own."""
     waves = np.zeros((len(seen.factors), seen.terms), np.float32)
     partners = np.zeros((*waves.shape, seen.terms), np.float32)
     for number, factors in enumerate(seen.factors):
