@@ -65,8 +65,6 @@ def test_next_attempts_have_room(monkeypatch):
     with pytest.warns(prt.PrtWarning, match="was not met"):
         found = prt.precompute(scene, lighting, "gather", target_error=1e-4, progress=False)
     assert found.report["plan"] == first["plan"]
-    chosen = [plan for plan in found.report["plans"] if plan["chosen"]]
-    assert len(chosen) == 1 or not found.report["plans"]
     assert any("a next attempt" in left and "more memory" in left for left in found.report["skipped"])
 
 

@@ -202,6 +202,9 @@ def test_what_is_to_blame_is_refined():
     parts = {"direct": 0.0, "indirect": 0.01, "specular": 0.06}
     found = HeldOutError(math.hypot(*parts.values()), {}, {"total": 0.0}, 100, parts, [])
     assert not ranking.after(found, 110.0)
+    ranking.leave()  # as if memory had had no room for it
+    assert (ranking.plan.direct, ranking.plan.rays) == ("consensus", 64)
+    assert [plan["direct"] for plan in ranking.report() if plan["chosen"]] == ["consensus"]
 
 
 def test_gathering_learns_its_bias(grey_scene):
