@@ -41,7 +41,10 @@ Columns = Annotated[int, typer.Option(help="Lights that light all samples, one f
 Seconds = Annotated[
     float | None,
     typer.Option(
-        metavar="SECONDS", help="Choose --rows and --columns so that it takes so long.", show_default=False
+        "--seconds",  # by name: typer 0.27 makes it --SECONDS after the metavar
+        metavar="SECONDS",
+        help="Choose --rows and --columns so that it takes so long.",
+        show_default=False,
     ),
 ]
 ErrorOption = Annotated[

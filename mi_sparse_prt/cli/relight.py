@@ -80,7 +80,10 @@ Samples = Annotated[
 MatrixScene = Annotated[
     Path | None,
     typer.Option(
-        metavar="SCENE", help="Mitsuba scene of the matrix.", show_default="the one it was computed for"
+        "--scene",  # by name: typer 0.27 makes it --SCENE after the metavar
+        metavar="SCENE",
+        help="Mitsuba scene of the matrix.",
+        show_default="the one it was computed for",
     ),
 ]
 

@@ -26,6 +26,7 @@ from mi_sparse_prt.manylights.light_arrays import facing, reflected
 from mi_sparse_prt.manylights.particles import next_2d
 from mi_sparse_prt.manylights.samples import Receivers, Samples
 from mi_sparse_prt.manylights.surfaces import BENT
+from mi_sparse_prt.scene.materials import sample_weight
 from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
 
@@ -211,7 +212,7 @@ class _Tracer:
             turns, straight = (kind & BENT) != 0, mi.has_flag(kind, mi.BSDFFlags.Null)
             share, through = self._left(at, start, si, out, linked & ~straight & ~turns, active)
             specular |= linked & ~straight & (turns | through)
-            throughput *= weight * share
+            throughput *= sample_weight(sample, weight) * share
             linked &= straight
             density = dr.select(straight, density, dr.select(turns, 0, sample.pdf))
             before = dr.select(straight, before, si.p)
@@ -235,6 +236,7 @@ class _Tracer:
             sample, weight = bsdf.sample(context, at.si, rng.next_float32(), next_2d(rng), own)
             local = dr.select(own, sample.wo, local)
             single = mi.has_flag(mi.UInt32(sample.sampled_type), mi.BSDFFlags.Delta)
+            weight = sample_weight(sample, weight)
             throughput = dr.select(own, dr.select(single, 0, at.weight * weight), throughput)
             value = bsdf.eval(context, at.si, local, own)
             receives = receiving(mi.Frame3f.cos_theta(local), dr.select(own, value, 0))

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from mi_sparse_prt.manylights.light_arrays import COSINE, SURFACE, LightArrays, no_lights
 from mi_sparse_prt.manylights.surfaces import Surfaces, diffuse_value
+from mi_sparse_prt.scene.materials import sample_weight
 from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
 
 LONGEST = 256  # surfaces that a particle meets, where ``max_depth`` sets no limit
@@ -62,7 +63,7 @@ def trace_particles(scene: mi.Scene, emit: Emit, count: int, max_depth: int) -> 
         lands = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         sample, weight = bsdf.sample(context, si, rng.next_float32(), next_2d(rng), alive)
         out = si.to_world(sample.wo)
-        after = flux * weight * _adjoint(si, ray.d, out)
+        after = flux * sample_weight(sample, weight) * _adjoint(si, ray.d, out)
         before = dr.max(flux)
         survival = dr.minimum(
             dr.max(after) / dr.maximum(before, 1e-30), 1 if depth < ROULETTE_DEPTH else 0.95

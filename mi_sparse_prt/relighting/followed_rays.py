@@ -16,7 +16,7 @@ import mitsuba as mi
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.reflection.reflection import Reflection
-from mi_sparse_prt.scene.materials import single_direction
+from mi_sparse_prt.scene.materials import sample_weight, single_direction
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.scene.traced_scene import TracedScene
 
@@ -147,6 +147,7 @@ def _scattered(
     sample, weight = single_direction(si, u, v, alone, delta)
     if not (whole.state == dr.VarState.Literal and dr.none(whole)):
         every, its = bsdf.sample(mi.BSDFContext(), si, u, v, active & whole)
+        its = sample_weight(every, its)
         sample, weight = dr.select(whole, every, sample), dr.select(active & whole, its, weight)
     return sample, weight
 

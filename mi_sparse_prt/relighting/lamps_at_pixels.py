@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mi_sparse_prt.relighting.followed_rays import Seen, Way, follow
 from mi_sparse_prt.relighting.image import RelitIntegrator, RelitScene
-from mi_sparse_prt.scene.materials import is_one_of
+from mi_sparse_prt.scene.materials import is_one_of, sample_weight
 from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.paths import has_mirrors
@@ -103,6 +103,8 @@ class LampLitIntegrator(RelitIntegrator):
         share = dr.select(there.delta, 1, there.pdf / (there.pdf + density))
         value += dr.select(asked, reflected * light * share, 0)
 
+        weight = sample_weight(sample, weight)
+        reflects &= ~dr.all(weight == 0)
         ray = si.spawn_ray(si.to_world(sample.wo))
         met = self._traced.ray_intersect(ray, reflects)
         radiance = met.emitter(self._scene, reflects).eval(met, reflects)

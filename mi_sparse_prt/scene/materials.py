@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
+from mi_sparse_prt.core.variant import variant
+from mi_sparse_prt.scene.even_texture import EvenTexture
 from mi_sparse_prt.scene.notes import Fact, Notes
 from mi_sparse_prt.scene.traversal import children
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
@@ -93,6 +95,15 @@ def single_direction(
     # for numbers that are, or are rounded to, 1, BSDFs choose the last of their kinds even if it is not asked for
     found = active & ((mi.UInt32(sample.sampled_type) & kinds) != 0)
     return sample, dr.select(found, weight, 0)
+
+
+def sample_weight(sample: mi.BSDFSample3f, weight: mi.Color3f) -> mi.Color3f:
+    """The weight of a BSDF's sample, 0 where rounding left it no direction or no density, as some at grazing angles.
+
+    A weight that is not a number otherwise is a BSDF's fault, and stays.
+    """
+    found = dr.isfinite(sample.pdf) & dr.all(dr.isfinite(sample.wo))
+    return dr.select(found, weight, 0)
 
 
 def bends_normals(bsdf: mi.BSDF) -> bool:
@@ -192,7 +203,9 @@ class Material:
             return None
         values = mi.traverse(self._emitter)
         if "radiance.value" not in values:
-            return mi.load_dict({"type": "area", "radiance": self._radiance})
+            apart = variant() == "cuda_ad_rgb" and self._radiance.is_spatially_varying()
+            radiance = EvenTexture(self._radiance) if apart else self._radiance
+            return mi.load_dict({"type": "area", "radiance": radiance})
         radiance = np.ravel(values["radiance.value"]).astype(float)
         spectrum = {"type": "rgb", "value": np.broadcast_to(radiance, 3).tolist()}
         return mi.load_dict({"type": "area", "radiance": spectrum})

@@ -23,6 +23,7 @@ from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.scene.materials import sample_weight
 from mi_sparse_prt.solvers.paths import Estimate, has_mirrors
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -301,7 +302,7 @@ class _Samples:
         sample, weight = si.bsdf().sample(
             mi.BSDFContext(), si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         )
-        throughput = paths.throughput * weight
+        throughput = paths.throughput * sample_weight(sample, weight)
         survival = dr.minimum(dr.max(dr.abs(throughput)), SURVIVAL)
         ends = rng.next_float32() >= survival  # never for NaN, so that it is noticed
         paths.throughput = dr.select(ends, 0, throughput / survival)

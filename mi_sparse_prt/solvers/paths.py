@@ -21,7 +21,7 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
-from mi_sparse_prt.scene.materials import is_one_of
+from mi_sparse_prt.scene.materials import is_one_of, sample_weight
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -282,7 +282,7 @@ def trace_reflected(
 
         # Next surface
         depth += 1
-        throughput *= weight
+        throughput *= sample_weight(sample, weight)
         ray = si.spawn_ray(si.to_world(sample.wo))
         mirrored, density = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), sample.pdf
         counts |= ~mirrored & ~rough

@@ -27,7 +27,7 @@ from mi_sparse_prt.emission.cube_faces import face_coordinates, texel_at
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.operators.operator import Ids
-from mi_sparse_prt.scene.materials import is_one_of, single_direction
+from mi_sparse_prt.scene.materials import is_one_of, sample_weight, single_direction
 from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces, cosine_rays, sobol
 from mi_sparse_prt.solvers.lamps import lamp_asked, lamp_met
 from mi_sparse_prt.solvers.problem import Problem
@@ -458,7 +458,7 @@ class SpecularChains:
         rough = is_one_of(self._rough_glass, si)
         sample, weight = single_direction(si, u, v, active & ~rough, delta)
         every, its = si.bsdf().sample(mi.BSDFContext(), si, u, v, active & rough)
-        return dr.select(rough, every, sample), dr.select(rough, its, weight)
+        return dr.select(rough, every, sample), dr.select(rough, sample_weight(every, its), weight)
 
 
 def kept_ends(ends: _Ends) -> tuple[NDArray[np.uint32], NDArray[np.uint32], Floats]:

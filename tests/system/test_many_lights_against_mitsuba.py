@@ -1,5 +1,7 @@
 """Many lights against Mitsuba's own integrators, one physical situation each."""
 
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from mi_sparse_prt.manylights.samples import Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
 
 T = mi.ScalarTransform4f
+SCENES = Path(__file__).parents[2] / "scenes_xml"
 SIZE, BLOCK, SEEDS = 24, 4, 4
 RED = diffuse(0.7, 0.5, 0.2)
 LAMP = {
@@ -29,7 +32,7 @@ PANE = {
 }
 CURVE = {
     "type": "bsplinecurve",
-    "filename": "scenes_xml/zoo/curls.txt",
+    "filename": str(SCENES / "zoo/curls.txt"),
     "to_world": T().translate([0, 1, 0]),
 }
 
@@ -239,7 +242,7 @@ def test_millions_of_triangles_by_instances() -> None:
     """
     group = {
         "type": "shapegroup",
-        "bunny": {"type": "ply", "filename": "scenes_xml/meshes/bunny.ply", "bsdf": RED},
+        "bunny": {"type": "ply", "filename": str(SCENES / "meshes/bunny.ply"), "bsdf": RED},
     }
     count = len(mi.load_dict(group["bunny"]).faces_buffer()) // 3
     instances = {

@@ -62,13 +62,16 @@ def corner(**more: object) -> mi.Scene:
 
 
 def furnace() -> mi.Scene:
-    """Inside of a closed grey sphere of radius 1 that shines."""
+    """Inside of a closed grey sphere of radius 1 that shines.
+
+    It is a mesh: from places on a sphere itself, rounding decides whether Mitsuba samples it as from outside, and its
+    ``path`` finds 0.1% too much light, clamped elements 0.2 to 3% (most on a GPU).
+    """
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     inside = {"type": "sphere", "flip_normals": True, "bsdf": diffuse(0.5, 0.5, 0.5)}
     inside["emitter"] = {"type": "area", "radiance": 1.0}
-    return mi.load_dict(
-        {"type": "scene", "ball": inside, "sensor": {"type": "perspective", "fov": 60, "film": film}}
-    )
+    scene = {"type": "scene", "ball": inside, "sensor": {"type": "perspective", "fov": 60, "film": film}}
+    return prt.Scene.from_mitsuba(mi.load_dict(scene), 0.1).mitsuba
 
 
 def elements_of(scene: mi.Scene, max_depth: int, clamp: float, seed: int, lights: int = 600) -> Elements:
@@ -200,22 +203,24 @@ def test_depths_are_those_of_path(depth: int) -> None:
 # -- where the answer is known ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # its shape is a lamp
 def test_a_furnace_is_whole() -> None:
     """Inside of a sphere of radius 1, all geometry terms are 1/4: a clamp of 0.1 takes three fifths of indirect light.
 
     Rationale: with albedo 1/2 and depth 4, radiance is 1 + 1/2 + 1/4 + 1/8, the last two of them indirect.
-    Expected: 0.6 (1/4 + 1/8) = 0.225 is left out, and with it the image has 1.875, within 4 standard errors; with
-    paths from all samples these are below 0.2%, and the survey of some says the same within its own.
+    Expected: 0.6 (1/4 + 1/8) = 0.225 is left out, within 4 standard errors and 0.2%, and with it the image has 1.875;
+    with paths from all samples these are below 0.2%, and the survey of some says the same within its own.
     """
     settings = {"rows": 30, "columns": 60, "lights": 2000, "max_depth": 4, "clamp": 0.1}
     whole = prt.render_many_lights(furnace(), compensate=True, **settings)
     plain = prt.render_many_lights(furnace(), **settings)
     for report, added in ((whole.report, True), (plain.report, False)):
-        found = report["left_out"]
+        found, of = report["left_out"], float(whole.image.mean())
         assert found["added"] == added and found["specular"] == {"share": 0, "standard_error": 0}
         share, error = found["clamped"].values()
         assert error < (0.002 if added else 0.01)
-        assert share == pytest.approx(0.225 / 1.875, abs=4 * error + 1e-3)
+        print(f"{share * of:.5f} +- {error * of:.5f}")
+        assert share * of == pytest.approx(0.225, abs=4 * error * of + 0.002 * 0.225)
     assert plain.image.mean() == pytest.approx(1.65, rel=0.005)
     assert whole.image.mean() == pytest.approx(1.875, rel=0.005)
 

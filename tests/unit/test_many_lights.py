@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -32,6 +33,7 @@ from mi_sparse_prt.manylights.samples import Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
 
 T = mi.ScalarTransform4f
+ZOO = Path(__file__).parents[2] / "scenes_xml/zoo"
 FLOOR = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": diffuse(0.6, 0.5, 0.4)}
 LAMP = {
     "type": "rectangle",
@@ -563,7 +565,7 @@ def test_the_integrator_refuses_to_be_inside_of_another(small_room: mi.Scene) ->
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.PrtWarning")
 def test_scenes_come_as_files_and_as_this_package_loads_them() -> None:
     """Expected: the same image of the same file; of shapes as this package has them within 10%, by other samples."""
-    path, asked = "scenes_xml/zoo/emitter_point.xml", {**SMALL, "rows": 60, "columns": 300}
+    path, asked = str(ZOO / "emitter_point.xml"), {**SMALL, "rows": 60, "columns": 300}
     first, again = (mi.load_file(path, optimize=False) for _ in range(2))
     image = prt.render_many_lights(first, **asked).image
     assert np.array_equal(image, prt.render_many_lights(again, **asked).image)
