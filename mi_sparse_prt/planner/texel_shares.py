@@ -49,12 +49,12 @@ class TexelShares:
         ----------
         plan : Plan
         share : float
-            Of the target error, which direct light may have.
+            Of the target error, which edges may have; strata take as many rays as half of its square needs.
         """
         settings = self._settings
         target = settings.target_error
-        aim = plan.tolerance if target is None else MARGIN * share * target
-        if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= aim:
+        enough, aim = (plan.tolerance if target is None else MARGIN * part * target for part in (share, HALF))
+        if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= enough:
             return plan
         if aim not in self._costs:
             self._costs[aim] = adaptive_cost(self._direct, self._held, aim, settings.seed)

@@ -19,6 +19,7 @@ from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import random_generator
 from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
+from mi_sparse_prt.operators.fractional_visibility import FULL
 from mi_sparse_prt.operators.mean_cosine import FIXED_POINT
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.solvers.problem import Problem
@@ -160,51 +161,57 @@ class DirectSolver:
                 cosine[part] = self.weighted_means(points, texels, lambda *_: [mi.Float(1)], seed)[0].numpy()
         return cosine * self.lighting.solid_angles[texel_ids] / np.float32(np.pi)
 
-    def shares(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.int16]:
+    def shares(
+        self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer], strata: int | None = None
+    ) -> NDArray[np.int16]:
         """What is seen of listed texels, (n,): of their mean cosine above the horizon, 255 is all; -1 below it.
 
-        Texel basis. As far as rays in strata can tell; a lane traces those of a row of strata, one after the other.
+        Texel basis. As far as rays in strata can tell, of which there may be others than the solver's.
         """
-        found = np.zeros(len(point_ids), np.int16)
-        size = LANES // self.strata
+        found, strata = np.zeros(len(point_ids), np.int16), strata or self.strata
+        size = LANES // strata**2
         for a in range(0, len(point_ids), size):
             part = slice(a, a + size)
             # one more: Dr.Jit would compile another kernel for arrays of size one
             ids = (np.append(some[part], some[part][-1:]) for some in (point_ids, texel_ids))
-            seen, total = self._summed(*(on_device(mi.UInt32, some) for some in ids))
-            share = dr.select(total > 0, mi.Int32(255 * seen / total + 0.5), -1)
-            found[part] = share.numpy()[:-1]
+            points, texels = (on_device(mi.UInt32, some) for some in ids)
+            found[part] = self._shares(points, texels, strata).numpy()[:-1]
         return found
 
-    def _summed(self, points: mi.UInt32, texels: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-        """Cosines times solid angles of what is seen of texels, and of all above the horizon."""
+    def rows_of_shares(self, point_ids: NDArray[np.integer]) -> NDArray[np.int16]:
+        """``shares`` of all texels, (n, n_texels)."""
+        found = np.zeros((len(point_ids), self._n_texels), np.int16)
+        size = max(1, LANES // (self._n_texels * self.rays_per_element))
+        for a in range(0, len(point_ids), size):
+            ids = np.append(point_ids[a : a + size], point_ids[-1:])
+            lane = dr.arange(mi.UInt32, len(ids) * self._n_texels)
+            row = lane // self._n_texels
+            point = dr.gather(mi.UInt32, on_device(mi.UInt32, ids), row)
+            shares = self._shares(point, lane - row * self._n_texels, self.strata).numpy()
+            found[a : a + size] = shares.reshape(len(ids), -1)[:-1]
+        return found
+
+    def _shares(self, points: mi.UInt32, texels: mi.UInt32, strata: int) -> mi.Int32:
+        """See ``shares``: one ray in each lane, those of a texel side by side, where they are coherent."""
         # one kernel for all numbers of strata
-        across = dr.opaque(mi.UInt32, self.strata)
-        lane = dr.arange(mi.UInt32, len(texels) * self.strata)
-        element = lane // across
-        row = lane - element * across
+        across, rays = (dr.opaque(mi.UInt32, number) for number in (strata, strata**2))
+        lane = dr.arange(mi.UInt32, len(texels) * strata**2)
+        element = lane // rays
+        stratum = lane - element * rays
+        row = stratum // across
         point, texel = dr.gather(mi.UInt32, points, element), dr.gather(mi.UInt32, texels, element)
-        rng = random_generator(self._points.key(point), texel, SHARES + row, self.seed)
-
-        def trace(
-            column: mi.UInt32, rng: mi.PCG32, seen: mi.Float, total: mi.Float
-        ) -> tuple[mi.UInt32, mi.PCG32, mi.Float, mi.Float]:
-            u, v = ((mi.Float(k) + rng.next_float32()) / mi.Float(across) for k in (column, row))
-            direction, area = self._texels.inside(texel, u, v)
-            visible, cosine = self.trace(point, direction, mi.Mask(True))
-            every = dr.maximum(cosine, 0) * area
-            return column + 1, rng, seen + dr.select(visible, every, 0), total + every
-
-        # what looks through surfaces evaluates on the way
-        passes = self.problem.specular_apart and self.problem.scene.passes_straight
-        n = len(lane)
-        state = dr.zeros(mi.UInt32, n), rng, dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
-        *_, seen, total = dr.while_loop(
-            state, lambda column, *_: column < across, trace, mode="evaluated" if passes else "symbolic"
+        rng = random_generator(self._points.key(point), texel, SHARES + stratum, self.seed)
+        uv = (
+            (mi.Float(place) + rng.next_float32()) / mi.Float(across)
+            for place in (stratum - row * across, row)
         )
-        dr.eval(seen, total)
-        seen, total = (dr.block_reduce(dr.ReduceOp.Add, x, self.strata) for x in (seen, total))
-        return seen, total
+        direction, area = self._texels.inside(texel, *uv)
+        visible, cosine = self.trace(point, direction, mi.Mask(True))
+        every = dr.maximum(cosine, 0) * area
+        seen = dr.select(visible, every, 0)
+        dr.eval(seen, every)
+        seen, total = (dr.block_reduce(dr.ReduceOp.Add, x, strata**2) for x in (seen, every))
+        return dr.select(total > 0, mi.Int32(FULL * seen / total + 0.5), -1)
 
     def visible(self, point_ids: NDArray[np.integer], texel_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Whether points see the centres of texels, (n,) bool; never below the horizon. One ray per element."""
