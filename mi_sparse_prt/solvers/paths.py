@@ -23,6 +23,7 @@ from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.materials import is_one_of, sample_weight
 from mi_sparse_prt.scene.traced_scene import TracedScene
+from mi_sparse_prt.solvers.direct_rays import pass_straight
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # paths per wavefront, about half a second each
@@ -181,7 +182,14 @@ class PathSolver:
         light = Light(shadow)
         if has_mirrors(self.scene) or apart:
             inside = lambda d: self._texels.contains(texel, d)  # noqa: E731
-            light = Light(shadow, inside, 1 / mean, apart, self.problem.scene.rough_glass)
+            light = Light(
+                shadow,
+                inside,
+                1 / mean,
+                apart,
+                self.problem.scene.rough_glass,
+                passes=self.problem.scene.passes_straight,
+            )
         return list(trace_reflected(self.scene, ray, light, rng, bounces)[0])
 
 
@@ -206,6 +214,10 @@ class Light:
     met : callable, optional
         Of lamps, in place of ``contains``: the radiance that rays meet, and the density with which ``sample`` finds it.
         Both estimates count, by the balance heuristic of multiple importance sampling.
+    passes : bool
+        Of light with ``contains``: shadow rays tell what masks, panes and ``null`` let through straight on, and paths
+        that have met no other mirrors and glass do not. ``path`` finds it by such paths alone, which seldom leave the
+        scene towards one texel.
     """
 
     sample: Callable[[Any, Any], tuple[Any, Any, Any, Any]]
@@ -214,6 +226,7 @@ class Light:
     scattered: bool = False
     rough_glass: Sequence[mi.BSDF] = ()
     met: Callable[[mi.SurfaceInteraction3f, mi.Ray3f, mi.Mask], tuple[mi.Color3f, mi.Float]] | None = None
+    passes: bool = False
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any, Any]]:
@@ -245,11 +258,12 @@ def trace_reflected(
     result, throughput = [mi.Color3f(0) for _ in range(apart)], mi.Color3f(1)
     depth = mi.UInt32(0)
     mirrored, counts, density = mi.Mask(False), mi.Mask(not light.scattered), mi.Float(0)
+    bent = mi.Mask(False)  # by mirrors or glass, since the last surface that scattered
     active = mi.Mask(depth < bounces)
     while active:
         si = scene.ray_intersect(ray, active)
         if light.contains is not None:
-            escaped = active & mirrored & counts & ~si.is_valid()
+            escaped = active & (bent if light.passes else mirrored) & counts & ~si.is_valid()
             found = dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
             result = added(result, depth, found)
         if light.met is not None:
@@ -275,16 +289,23 @@ def trace_reflected(
         rough = is_one_of(light.rough_glass, si)
         lit = active & ~dr.all(value == 0) & (counts | ~rough)
         shadow = si.spawn_ray(towards) if reach is None else si.spawn_ray_to(si.p + towards * reach)
-        lit &= ~scene.ray_test(shadow, lit)
+        passed = mi.UInt32(0)
+        if light.passes:
+            onwards = lambda there, towards=towards: there.spawn_ray(towards)  # noqa: E731
+            share, passed, _ = pass_straight(scene, shadow, lit, bounces - depth - 1, onwards, lambda x: x)
+            value *= share
+        else:
+            lit &= ~scene.ray_test(shadow, lit)
         if light.met is not None:
             irradiance *= dr.select(chance > 0, chance / (chance + other), 1)
-        result = added(result, depth + 1, dr.select(lit, throughput * value * irradiance, 0))
+        result = added(result, depth + 1 + passed, dr.select(lit, throughput * value * irradiance, 0))
 
         # Next surface
         depth += 1
         throughput *= sample_weight(sample, weight)
         ray = si.spawn_ray(si.to_world(sample.wo))
         mirrored, density = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), sample.pdf
+        bent = mirrored & (bent | ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null))
         counts |= ~mirrored & ~rough
         active &= ~dr.all(throughput == 0)  # and not any(... != 0), which is false for NaN here
         if light.contains is None and light.met is None:
