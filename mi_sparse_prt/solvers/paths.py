@@ -258,12 +258,15 @@ def trace_reflected(
     result, throughput = [mi.Color3f(0) for _ in range(apart)], mi.Color3f(1)
     depth = mi.UInt32(0)
     mirrored, counts, density = mi.Mask(False), mi.Mask(not light.scattered), mi.Float(0)
-    bent = mi.Mask(False)  # by mirrors or glass, since the last surface that scattered
+    # by mirrors or glass, since the last surface that scattered; before the first one no shadow ray tells what passes
+    bent = mi.Mask(not light.scattered)
     active = mi.Mask(depth < bounces)
     while active:
         si = scene.ray_intersect(ray, active)
         if light.contains is not None:
-            escaped = active & (bent if light.passes else mirrored) & counts & ~si.is_valid()
+            escaped = active & mirrored & counts & ~si.is_valid()
+            if light.passes:
+                escaped &= bent
             found = dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
             result = added(result, depth, found)
         if light.met is not None:
