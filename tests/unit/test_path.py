@@ -279,7 +279,9 @@ def test_shadow_rays_tell_what_passes_straight(basis, depth, monkeypatch):
     means = [np.mean(x, axis=0) for x in (ours, theirs)]
     error = np.sqrt(sum(np.var(x, axis=0, ddof=1) / len(x) for x in (ours, theirs)))
     gain = np.mean(others) / np.mean(variances)
-    print(f"{means[0].sum() / means[1].sum() - 1:.2%} +- {error / np.maximum(means[1], 1e-9)}; {gain:.1f} times")
+    print(
+        f"{means[0].sum() / means[1].sum() - 1:.2%} +- {error / np.maximum(means[1], 1e-9)}; {gain:.1f} times"
+    )
     assert np.all(np.abs(means[0] - means[1]) <= 4 * error)
     assert means[0].sum() == pytest.approx(means[1].sum(), rel=0.02)
     assert depth != 4 or gain > 5
