@@ -12,7 +12,10 @@ from mi_sparse_prt.scene.mesh_cleaning import drop_degenerate, drop_unreferenced
 from mi_sparse_prt.scene.subdivision import too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, concatenated, normalise_rows
 
-FEWEST = 10  # vertices around a tube, however thin
+FEWEST = 10  # vertices around a tube
+# the same of one whose girth is half an edge at most, as hair: it is a pixel wide, and has light by its normals alone,
+# which is smooth (99% of irradiance is in harmonics up to the second, Ramamoorthi and Hanrahan 2001)
+FEWEST_OF_HAIR = 6
 TURN = np.pi / 10  # rings turn by at most this much
 
 Rows = NDArray[np.float64]
@@ -66,7 +69,9 @@ def curve_mesh(shape: mi.Shape, edge_length: float, name: str, limit: int) -> Tr
         own = points[first[segments[0]] : first[segments[-1]] + (4 if spline else 2)]
         rings = _spline(own, edge_length) if spline else _polyline(own, edge_length)
         rings.along = (rings.along + segments[0]) / len(first)
-        around = max(FEWEST, int(np.ceil(2 * np.pi * rings.radii.max() / edge_length)))
+        girth = 2 * np.pi * rings.radii.max()
+        hair = girth <= edge_length / 2 < np.inf
+        around = max(FEWEST_OF_HAIR if hair else FEWEST, int(np.ceil(girth / edge_length)))
         count += len(rings.radii) * (around + 1)
         if count > limit:
             raise too_many_vertices(name, edge_length, limit)
