@@ -143,6 +143,7 @@ def _ask_again(
                     differing += abs(shares[i, near[t, k]] - own)
             most = max(own, others)
             if most - least > ALIKE:
+                # how many beside are seen otherwise; strata, when all are known
                 again[i, t] = BESIDE if 0 < own < FULL else min(max(differing // FULL, 1), BESIDE)
             total += own / FULL
             single += 0 < own * few**2 < SINGLE * FULL and others == 0
