@@ -27,7 +27,7 @@ from mi_sparse_prt.manylights.particles import next_2d
 from mi_sparse_prt.manylights.samples import Receivers, Samples
 from mi_sparse_prt.manylights.surfaces import BENT
 from mi_sparse_prt.scene.materials import sample_weight
-from mi_sparse_prt.solvers.direct_rays import pass_straight
+from mi_sparse_prt.solvers.direct_rays import arriving_share
 from mi_sparse_prt.solvers.paths import ROULETTE_DEPTH
 
 PATHS = 16  # of each sample
@@ -310,11 +310,9 @@ class _Tracer:
         """What nothing is in the way of; masks and panes let a part through, as they do for elements."""
         active = active & ~dr.all(value == 0)  # NaN is lit, so that it is noticed
         ray = si.spawn_ray_to(towards.p)
-        if not self.surfaces.passes_straight:
-            return dr.select(active & ~self.scene.ray_test(ray, active), value, 0)
         onwards = lambda there: there.spawn_ray_to(towards.p)  # noqa: E731
-        share, _, _ = pass_straight(self.scene, ray, active, most, onwards, lambda c: c)
-        return dr.select(active, value * share, 0)
+        share, _ = arriving_share(self.scene, ray, active, self.surfaces.passes_straight, most, onwards)
+        return dr.select(active & (dr.max(share) > 0), value * share, 0)
 
 
 def _mis(a: mi.Float, b: mi.Float) -> mi.Float:

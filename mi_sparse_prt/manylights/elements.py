@@ -17,7 +17,7 @@ from mi_sparse_prt.manylights.light_arrays import DIRECTION, LightArrays, arrivi
 from mi_sparse_prt.manylights.lights import Lights
 from mi_sparse_prt.manylights.samples import Receivers, Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
-from mi_sparse_prt.solvers.direct_rays import pass_straight
+from mi_sparse_prt.solvers.direct_rays import arriving_share
 
 LANES = 1 << 23  # elements of a kernel: about a fifth of a second
 ROWS = 16  # whose projections are added up at a time: sums are the same however many rows a kernel has
@@ -287,11 +287,10 @@ class Elements:
                 ray.wavelengths,
             )
 
-        if not self.surfaces.passes_straight:
-            return dr.select(active & ~self.scene.ray_test(towards(at.si), active), value, 0)
         most = dr.opaque(mi.UInt32, self.max_depth) - light.depth - at.depth
-        share, _, _ = pass_straight(self.scene, towards(at.si), active, most, towards, lambda c: c)
-        return dr.select(active, value * share, 0)
+        passes = self.surfaces.passes_straight
+        share, _ = arriving_share(self.scene, towards(at.si), active, passes, most, towards)
+        return dr.select(active & (dr.max(share) > 0), value * share, 0)
 
     @dr.syntax
     def _accumulated(self, total: mi.Color3f, chosen: _Chosen, first: mi.UInt32, count: int) -> mi.Color3f:

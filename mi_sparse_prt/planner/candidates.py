@@ -30,9 +30,8 @@ from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 ATTEMPTS = 4
-FIRST_SHARE = (
-    0.8  # of a target, which edges may leave of direct light in a first attempt: 0.6 is left to the rest
-)
+# of a target error, which edges may leave of direct light in a first attempt: 0.6 is left to the rest
+FIRST_SHARE = 0.8
 TIME_BUDGET = 20.0  # times what the first attempt was to take: what is to take longer is left to the user
 
 

@@ -9,8 +9,8 @@ class EvenTexture(mi.Texture):
     """Looks up another texture, and says that it does not vary, so that area lights sample their surface evenly.
 
     Of a texture that varies, Mitsuba's ``area`` samples places by their brightness, and finds them on a mesh by rays in
-    a scene of that mesh alone. On a GPU a kernel can trace rays in one scene only. Even samples are as right, and
-    noisier: twice, of a contrasty texture ten times.
+    a scene of that mesh alone. On a GPU a kernel can trace rays in one scene only. Even samples have no bias, and more
+    noise: twice as much, of a contrasty texture ten times.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class EvenTexture(mi.Texture):
         return self._texture.mean()
 
     def is_spatially_varying(self) -> bool:
-        """Not so, for who would sample it."""
+        """Never: area lights sample their surface, then."""
         return False
 
     def to_string(self) -> str:

@@ -419,6 +419,29 @@ def pass_straight(
     return share, count, boundary
 
 
+def arriving_share(
+    scene: mi.Scene | TracedScene,
+    ray: mi.Ray3f,
+    active: mi.Mask,
+    passes: bool,
+    most: mi.UInt32,
+    onwards: Callable[[Any], Any],
+) -> tuple[mi.Color3f, mi.UInt32]:
+    """The share of light that arrives along shadow rays, and by how many surfaces it went straight on.
+
+    Parameters
+    ----------
+    scene, ray, active, most, onwards
+        See ``pass_straight``.
+    passes : bool
+        Some surfaces of the scene let light pass; if none does, one quick ray tells.
+    """
+    if not passes:
+        return dr.select(scene.ray_test(ray, active), mi.Color3f(0), 1), mi.UInt32(0)
+    share, count, _ = pass_straight(scene, ray, active, most, onwards, lambda passed: passed)
+    return share, count
+
+
 def _packed(seen: mi.Mask, texel: mi.UInt32) -> mi.UInt32:
     """Bits of lanes, one word for as many as it has."""
     return dr.block_reduce(dr.ReduceOp.Or, dr.select(seen, mi.UInt32(1) << (texel & (BITS - 1)), 0), BITS)

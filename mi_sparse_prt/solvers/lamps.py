@@ -15,7 +15,7 @@ from mi_sparse_prt.core.random_keys import element_seeds, random_generator, rand
 from mi_sparse_prt.emission.space import SampledEmission
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.direct_rays import pass_straight
+from mi_sparse_prt.solvers.direct_rays import arriving_share
 from mi_sparse_prt.solvers.paths import Estimate, Light, PathSolver, has_mirrors, trace_reflected
 from mi_sparse_prt.solvers.problem import Problem
 
@@ -181,12 +181,8 @@ class LampRays:
 
     def _arriving(self, ray: mi.Ray3f, lamp_at: mi.Point3f, active: mi.Mask) -> mi.Color3f:
         """The share of light that arrives along shadow rays: what masks, thin panes and ``null`` let through counts."""
-        scene = self._scene.unsplit
-        if not self._scene.passes_straight:
-            return dr.select(scene.ray_test(ray, active), mi.Color3f(0), 1)
-        onwards = lambda si: ray_to(si.spawn_ray(ray.d), lamp_at)  # noqa: E731
-        share, _, _ = pass_straight(scene, ray, active, self._passable(), onwards, lambda passed: passed)
-        return share
+        scene, onwards = self._scene, lambda si: ray_to(si.spawn_ray(ray.d), lamp_at)
+        return arriving_share(scene.unsplit, ray, active, scene.passes_straight, self._passable(), onwards)[0]
 
 
 def _moments(samples: list[mi.Float], count: int) -> Estimate:

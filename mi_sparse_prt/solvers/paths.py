@@ -23,7 +23,7 @@ from mi_sparse_prt.emission.texel_arrays import TexelArrays
 from mi_sparse_prt.measurement.point_arrays import PointArrays, start_ray
 from mi_sparse_prt.scene.materials import is_one_of, sample_weight
 from mi_sparse_prt.scene.traced_scene import TracedScene
-from mi_sparse_prt.solvers.direct_rays import pass_straight
+from mi_sparse_prt.solvers.direct_rays import arriving_share
 from mi_sparse_prt.solvers.problem import Problem
 
 LANES = 1 << 22  # paths per wavefront, about half a second each
@@ -264,9 +264,7 @@ def trace_reflected(
     while active:
         si = scene.ray_intersect(ray, active)
         if light.contains is not None:
-            escaped = active & mirrored & counts & ~si.is_valid()
-            if light.passes:
-                escaped &= bent
+            escaped = active & mirrored & counts & ~si.is_valid() & (bent | mi.Mask(not light.passes))
             found = dr.select(escaped & light.contains(ray.d), throughput * light.radiance, 0)
             result = added(result, depth, found)
         if light.met is not None:
@@ -280,28 +278,19 @@ def trace_reflected(
         # Light, from one direction
         towards, irradiance, reach, chance = light.sample(si, rng)
         bsdf = si.bsdf(ray)
-        value, other, sample, weight = bsdf.eval_pdf_sample(
-            context,
-            si,
-            si.to_local(towards),
-            rng.next_float32(),
-            mi.Point2f(rng.next_float32(), rng.next_float32()),
-            active,
-        )
+        u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        value, other, sample, weight = bsdf.eval_pdf_sample(context, si, si.to_local(towards), u, v, active)
         # NaN is lit, so that it is noticed, and what factored BSDFs make negative
         rough = is_one_of(light.rough_glass, si)
         lit = active & ~dr.all(value == 0) & (counts | ~rough)
         shadow = si.spawn_ray(towards) if reach is None else si.spawn_ray_to(si.p + towards * reach)
-        passed = mi.UInt32(0)
-        if light.passes:
-            onwards = lambda there, towards=towards: there.spawn_ray(towards)  # noqa: E731
-            share, passed, _ = pass_straight(scene, shadow, lit, bounces - depth - 1, onwards, lambda x: x)
-            value *= share
-        else:
-            lit &= ~scene.ray_test(shadow, lit)
+        onwards = lambda there, towards=towards: there.spawn_ray(towards)  # noqa: E731
+        arrives, passed = arriving_share(scene, shadow, lit, light.passes, bounces - depth - 1, onwards)
+        lit &= dr.max(arrives) > 0
         if light.met is not None:
             irradiance *= dr.select(chance > 0, chance / (chance + other), 1)
-        result = added(result, depth + 1 + passed, dr.select(lit, throughput * value * irradiance, 0))
+        found = dr.select(lit, throughput * value * arrives * irradiance, 0)
+        result = added(result, depth + 1 + passed, found)
 
         # Next surface
         depth += 1
