@@ -95,8 +95,8 @@ def precompute(
         predictions; of ``"sparse"``, that starts with 5% of the vertices dense, twice as many; of ``"gather"``, that
         starts with 64 rays per vertex, four times as many. The report counts all that was evaluated on the way. For
         ``"brute_force"`` the pilot chooses the cheapest ``indirect_resolution`` and ``spp``, in place of those given.
-        A warning says if the
-        held-out error shows that the target was missed.
+        Of lamps, where paths are traced: the elements of a lamp have fewer paths than ``spp`` if so much noise is left
+        by them in its indirect light. A warning says if the held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices. What ``"auto"``
         chooses depends on measured times as well.
@@ -152,7 +152,7 @@ def precompute(
     folder = Path(checkpoint_folder) if checkpoint_folder else None
     run = Run(seed, progress=progress, checkpoint_folder=folder)
     if not isinstance(lighting, CubemapLighting):
-        given = harmonics, target_error, indirect_resolution, specular_error
+        given = harmonics, indirect_resolution, specular_error
         _check_sampled(lighting, method, terms, given)
     settings = Settings(
         lighting.resolution if isinstance(lighting, CubemapLighting) else 1,
@@ -355,8 +355,8 @@ def _check_sampled(
         )
     if terms not in (0, AUTO_TERMS) or any(value is not None for value in others):
         raise PrtError(
-            "lamps: terms, harmonics, target_error, indirect_resolution and specular_error are for light from a "
-            "cubemap; leave them out"
+            "lamps: terms, harmonics, indirect_resolution and specular_error are for light from a cubemap; "
+            "leave them out"
         )
     if method not in ("auto", "gather", "brute_force"):
         raise PrtError(f'method {method!r} knows no lamps; use "gather" or "brute_force", or leave it out')
@@ -372,10 +372,12 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run, seen=seen)
     else:
         settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
-        parts = path_traced_lamps(problem, run, settings.samples, seen=seen)
+        parts = path_traced_lamps(problem, run, settings.samples, settings.target_error, seen=seen)
     transport = matrix_of(problem, parts)
     with run.clock.phase("held_out"):
         error = held_out_lamp_error(problem, transport, run.seed)
+    if settings.target_error is not None:
+        _warn_if_missed(error, settings, None)
     transport.report.update(
         _account(parts, problem, [])
         | {"estimated_error": error.report()}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
 
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.sparse_product import multiply_scaled
@@ -12,9 +14,10 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.operator import Floats, Operator
-from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_levels
+from mi_sparse_prt.reconstruction.surface_smoothing import noise_left, smooth_light, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.lamps import LampRays, light_by_paths
+from mi_sparse_prt.solvers.lamps import PILOT, LampRays, PathEffort, light_by_paths, shared_out
+from mi_sparse_prt.solvers.paths import Estimate
 from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
@@ -59,12 +62,18 @@ def gathered_lamps(
 
 
 def path_traced_lamps(
-    problem: Problem, run: Run, spp: int = SPP, strata: int = 16, seen: bool = True
+    problem: Problem,
+    run: Run,
+    spp: int = SPP,
+    target: float | None = None,
+    strata: int = 16,
+    seen: bool = True,
 ) -> MethodResult:
     """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
 
     Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. See ``gathered_lamps``.
+    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if so much noise is left by them
+    in its indirect light, relative L2. See ``gathered_lamps``.
     """
     n, m = len(problem.points), problem.emission.size
     direct, indirect = None, None
@@ -72,17 +81,53 @@ def path_traced_lamps(
     if seen:
         direct, rays = _direct(problem, run, strata)
     if problem.max_depth != 2:
-        with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
-            asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
-            apart = 0 if problem.scene.diffuse else told_apart(problem.max_depth)
-            found, count = light_by_paths(problem, *asked, spp, run.seed, bar.update, max(apart, 1))
-            rays["indirect_paths"] = count
-        light, variance = (x.reshape(n, m, -1) for x in (found.mean, found.variance))
+        apart = 0 if problem.scene.diffuse else told_apart(problem.max_depth)
+        levels = None
         if problem.at_vertices is problem:
             with run.clock.phase("smoothing"):
-                light = smooth_light(light, variance, smoothing_levels(problem.scene, problem.points))
+                levels = smoothing_levels(problem.scene, problem.points)
+        effort = PathEffort(spp, run.seed)
+        if target is not None and levels is not None:
+            albedo = problem.reflection.albedo
+            effort = effort._replace(needed=lambda found: _paths_needed(found, albedo, levels, target, spp))
+        with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
+            asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
+            found, count = light_by_paths(problem, *asked, effort, bar.update, max(apart, 1))
+            rays["indirect_paths"] = count
+        light, variance = (x.reshape(n, m, -1) for x in (found.mean, found.variance))
+        if levels is not None:
+            with run.clock.phase("smoothing"):
+                light = smooth_light(light, variance, levels)
         indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
     return _result(direct, indirect, rays)
+
+
+def _paths_needed(
+    found: Estimate, albedo: Floats, levels: list[scipy.sparse.csr_array], target: float, spp: int
+) -> NDArray[np.int64]:
+    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in the light of its lamp.
+
+    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most.
+    """
+    n, seen = len(albedo), spp // PILOT
+    light, variance = (x.reshape(n, -1, x.shape[1] // 3, 3) for x in (found.mean, found.variance))
+    flat = (*light.shape[:2], -1)
+    left = noise_left(light.reshape(flat), variance.reshape(flat), levels).reshape(light.shape)
+    power = np.square(albedo.astype(np.float64))[:, None]
+    energy = (power * (np.square(light.sum(axis=2)) - variance.sum(axis=2))).sum(axis=(0, 2))
+    before, after = (
+        seen * (power * x.sum(axis=2)).sum(axis=2) for x in (variance, left)
+    )  # of one path (n, m)
+    least = np.full(light.shape[1], spp)
+    for lamp, enough in enumerate(target**2 * energy):
+        if 0 < after[:, lamp].sum() / seen <= enough:
+            least[lamp] = 0
+            continue
+        for few in (seen // 2, seen, 2 * seen):
+            if 0 < (after[:, lamp] / shared_out(before[:, lamp], seen, few)).sum() <= enough:
+                least[lamp] = few
+                break
+    return np.tile(least, n)
 
 
 def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, dict[str, int]]:

@@ -79,11 +79,11 @@ class SparsePRT(mi.SamplingIntegrator):
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
     precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16; of lamps
-                                   128)
+                                   64, where ``target_error`` does not take fewer)
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
-    target_error        float      Relative L2 error of the environment's matrix to aim at. (0: that of
-                                   ``prt.precompute``)
+    target_error        float      Relative L2 error of the environment's matrix to aim at, and of the noise that may
+                                   be left in the indirect light of lamps. (0: that of ``prt.precompute``)
     specular_error      float      Noise of light by way of mirrors and glass that is small enough, of that light alone.
                                    (0: it is part of ``target_error``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
@@ -203,7 +203,7 @@ class SparsePRT(mi.SamplingIntegrator):
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (k, n_v, 3) of light of lamps that met some, and at most 0, 1, ... surfaces; k may be 1."""
         lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
-        settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed")}
+        settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed", "target_error")}
         settings["method"] = "brute_force" if by_paths else "auto"
         settings["spp"] = settings["spp"] or LAMP_SPP
         transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)

@@ -206,12 +206,30 @@ def smooth_light(light: Floats, variance: Floats, levels: list[scipy.sparse.csr_
     """
     if not variance.any():  # nothing to average out, or one path per element: the noise is unknown
         return light
-    smoothing, flat = SurfaceSmoothing(levels), light.reshape(len(light), -1)
-    spread = variance.reshape(flat.shape)
+    smoothing = SurfaceSmoothing(levels)
+    chosen, _ = _least_risk(smoothing, light, variance)
+    return np.maximum(smoothing.averaged(light, chosen), 0)
+
+
+def noise_left(light: Floats, variance: Floats, levels: list[scipy.sparse.csr_array]) -> Floats:
+    """The variance (n_v, m, channels) that ``smooth_light`` leaves, about: what vertices have of their own values."""
+    smoothing = SurfaceSmoothing(levels)
+    chosen, noise = _least_risk(smoothing, light, variance)
+    kept = np.zeros(chosen.shape, np.float32)
+    for number, own in enumerate(smoothing.own):
+        kept += smoothing.pooled((chosen == number).astype(np.float32)) * np.maximum(own, 0)[:, None]
+    return kept[..., None] * noise
+
+
+def _least_risk(
+    smoothing: SurfaceSmoothing, light: Floats, variance: Floats
+) -> tuple[NDArray[np.int8], Floats]:
+    """How many levels leave the least error (n_v, m), by Stein's estimate; the noise (n_v, m, channels) without any."""
+    flat, spread = light.reshape(len(light), -1), variance.reshape(len(light), -1)
     noise = np.maximum(smoothing.pooled(spread), np.float32(OWN) * spread)
 
     def risk(smooth: Floats, number: int) -> Floats:
         found = (smooth - flat) ** 2 + (2 * smoothing.own[number][:, None] - 1) * noise
         return np.ascontiguousarray(found.reshape(light.shape).sum(axis=2))
 
-    return np.maximum(smoothing.averaged(light, smoothing.least(flat, risk)), 0)
+    return smoothing.least(flat, risk), noise.reshape(light.shape)

@@ -53,10 +53,10 @@ class SentLight:
             return light[:n]
         number = np.where(self.near < 0, -1, np.searchsorted(self.reflection.glossy, self.near))
         waves, partners = _turnings(seen)
-        terms = light[n:].reshape(-1, self.reflection.terms, light.shape[1])
+        terms = light[n:].reshape(len(self.reflection.glossy), self.reflection.terms, light.shape[1])
         result = np.empty((seen.row_count, light.shape[1]), np.float32)
         result[:n] = light[:n]
-        own = result[n:].reshape(-1, seen.terms, light.shape[1])
+        own = result[n:].reshape(len(seen.glossy), seen.terms, light.shape[1])
         turned = number, self.weights, self.angles, seen.material[seen.glossy], waves, partners
         run_in_parts(_interpolated, len(own), turned, terms, own)
         return result

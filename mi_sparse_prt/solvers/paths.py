@@ -227,6 +227,7 @@ class Light:
     rough_glass: Sequence[mi.BSDF] = ()
     met: Callable[[mi.SurfaceInteraction3f, mi.Ray3f, mi.Mask], tuple[mi.Color3f, mi.Float]] | None = None
     passes: bool = False
+    roulette: int = ROULETTE_DEPTH
 
 
 def distant(direction: mi.Vector3f, irradiance: mi.Float) -> Callable[[Any, Any], tuple[Any, Any, Any, Any]]:
@@ -306,7 +307,7 @@ def trace_reflected(
             active &= (depth < bounces) | (mirrored | mi.Mask(light.met is not None)) & (depth == bounces)
 
         # Russian roulette
-        survival = dr.select(depth >= ROULETTE_DEPTH, dr.minimum(dr.max(dr.abs(throughput)), 0.95), 1)
+        survival = dr.select(depth >= light.roulette, dr.minimum(dr.max(dr.abs(throughput)), 0.95), 1)
         active &= rng.next_float32() < survival
         throughput /= survival
     return result

@@ -229,6 +229,10 @@ def test_terms_of_flat_surfaces_do_not_depend_on_tangents(monkeypatch):
     print(len(sent.reflection.glossy), n, error)
     assert len(sent.reflection.glossy) < n / 5
     assert error.max() < 0.005
+    nothing = sent.interpolated(
+        rows[rows_among(sent.reflection, seen), :0], seen
+    )  # light of some depth, of no rank
+    assert nothing.shape == (seen.row_count, 0)
 
 
 @pytest.mark.usefixtures("no_held_out")
