@@ -96,7 +96,7 @@ def precompute(
         starts with 64 rays per vertex, four times as many. The report counts all that was evaluated on the way. For
         ``"brute_force"`` the pilot chooses the cheapest ``indirect_resolution`` and ``spp``, in place of those given.
         Of lamps, where paths are traced: the elements of a lamp have fewer paths than ``spp`` if so much noise is left
-        by them in its indirect light. A warning says if the held-out error shows that the target was missed.
+        by them in its light. A warning says if the held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices. What ``"auto"``
         chooses depends on measured times as well.
@@ -368,14 +368,23 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         _warn_if_glossy(problem.scene, "a matrix of lamps has no terms")
     settings, method = replace(settings, terms=0), settings.method
     seen = not isinstance(problem.emission, UnitLamps)  # pictures find the light that lamps send on directly
-    if method == "gather" or (method == "auto" and problem.scene.diffuse):
-        settings, parts = replace(settings, method="gather"), gathered_lamps(problem, run, seen=seen)
-    else:
+    by_paths = method == "brute_force" or (method == "auto" and not problem.scene.diffuse)
+    if by_paths:
         settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
-        parts = path_traced_lamps(problem, run, settings.samples, settings.target_error, seen=seen)
-    transport = matrix_of(problem, parts)
-    with run.clock.phase("held_out"):
-        error = held_out_lamp_error(problem, transport, run.seed)
+    else:
+        settings = replace(settings, method="gather")
+    for target in dict.fromkeys(
+        (settings.target_error, None)
+    ):  # what a target saves is done if it was missed
+        if by_paths:
+            parts = path_traced_lamps(problem, run, settings.samples, target, seen=seen)
+        else:
+            parts = gathered_lamps(problem, run, seen=seen)
+        transport = matrix_of(problem, parts)
+        with run.clock.phase("held_out"):
+            error = held_out_lamp_error(problem, transport, run.seed)
+        if not parts.skipped or target is None or error.total - 2 * error.standard_error["total"] <= target:
+            break
     if settings.target_error is not None:
         _warn_if_missed(error, settings, None)
     transport.report.update(

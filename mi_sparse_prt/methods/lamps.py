@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.sparse_product import multiply_scaled
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.operator import Floats, Operator
+from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reconstruction.surface_smoothing import noise_left, smooth_light, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
 from mi_sparse_prt.solvers.lamps import PILOT, LampRays, PathEffort, light_by_paths, shared_out
@@ -22,8 +25,14 @@ from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 
+Ids: TypeAlias = NDArray[np.int64]
+Doubles: TypeAlias = NDArray[np.float64]
+
 BLOCK = 4096  # points at a time
 NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct light together with it
+SAMPLE = 2048  # points whose direct light is looked at
+FEW = 4  # strata per axis of a lamp, of their shadow rays
+SAMPLED = 15  # spawn key
 SPP = 64  # paths of an element, where nothing else says how many
 
 
@@ -72,54 +81,94 @@ def path_traced_lamps(
     """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
 
     Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if so much noise is left by them
-    in its indirect light, relative L2. See ``gathered_lamps``.
+    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if by these the error is about as
+    much, relative L2 of all light of the lamp. Of more than 65,536 vertices only nodes have paths. See
+    ``gathered_lamps``.
     """
-    n, m = len(problem.points), problem.emission.size
-    direct, indirect = None, None
+    direct, indirect, skipped = None, None, list[str]()
     rays: dict[str, int] = {}
     if seen:
         direct, rays = _direct(problem, run, strata)
     if problem.max_depth != 2:
-        apart = 0 if problem.scene.diffuse else told_apart(problem.max_depth)
-        levels = None
-        if problem.at_vertices is problem:
-            with run.clock.phase("smoothing"):
-                levels = smoothing_levels(problem.scene, problem.points)
-        effort = PathEffort(spp, run.seed)
-        if target is not None and levels is not None:
-            albedo = problem.reflection.albedo
-            effort = effort._replace(needed=lambda found: _paths_needed(found, albedo, levels, target, spp))
-        with run.clock.phase("indirect"), run.bar(n * m, "indirect") as bar:
-            asked = np.repeat(np.arange(n), m), np.tile(np.arange(m), n)
-            found, count = light_by_paths(problem, *asked, effort, bar.update, max(apart, 1))
-            rays["indirect_paths"] = count
-        light, variance = (x.reshape(n, m, -1) for x in (found.mean, found.variance))
-        if levels is not None:
-            with run.clock.phase("smoothing"):
-                light = smooth_light(light, variance, levels)
+        apart, effort = (
+            0 if problem.scene.diffuse else told_apart(problem.max_depth),
+            PathEffort(spp, run.seed),
+        )
+        light, rays["indirect_paths"], saved = _by_paths(problem, run, effort, target, max(apart, 1))
         indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
-    return _result(direct, indirect, rays)
+        if saved:
+            skipped.append(f"paths: fewer than {spp} of an element, as the target error asks for no more")
+    return replace(_result(direct, indirect, rays), skipped=skipped)
+
+
+def _by_paths(
+    problem: Problem, run: Run, effort: PathEffort, target: float | None, apart: int
+) -> tuple[Floats, int, bool]:
+    """Indirect light (n, m, 3 * apart), how many paths found it, and if these were fewer than without a target.
+
+    Of many vertices some have paths, and others are between them.
+    """
+    points, m = problem.points, problem.emission.size
+    ids, nodes = np.arange(len(points)), None
+    if problem.at_vertices is problem:
+        with run.clock.phase("smoothing"):
+            nodes = choose_nodes(problem.scene, points)
+            ids, levels = nodes.ids, smoothing_levels(problem.scene, points, nodes.ids)
+        if target is not None:
+            albedo, spp, sent = (
+                problem.reflection.albedo[ids],
+                effort.spp,
+                _energy_sent(problem, ids, run.seed),
+            )
+            # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
+            share = target / 2
+            effort = effort._replace(
+                needed=lambda found: _paths_needed(found, albedo, sent, levels, share, spp)
+            )
+    with run.clock.phase("indirect"), run.bar(len(ids) * m, "indirect") as bar:
+        asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
+        found, count = light_by_paths(problem, *asked, effort, bar.update, apart)
+    light, variance = (x.reshape(len(ids), m, -1) for x in (found.mean, found.variance))
+    saved = target is not None and count < len(asked[0]) * (effort.spp + effort.spp // PILOT)
+    if nodes is None:
+        return light, count, False
+    with run.clock.phase("smoothing"):
+        smooth = smooth_light(light, variance, levels).reshape(len(ids), -1)
+        return np.maximum(nodes.interpolate(smooth), 0).reshape(len(points), m, -1), count, saved
+
+
+def _energy_sent(problem: Problem, ids: Ids, seed: int) -> Doubles:
+    """Squares (m,) of what points send on of direct light of each lamp, summed over them: about, from some of these."""
+    m, rng = problem.emission.size, np.random.default_rng(random_stream(seed, SAMPLED))
+    some = rng.permutation(ids)[:SAMPLE]
+    light = LampRays(problem, FEW, seed).elements(np.repeat(some, m), np.tile(np.arange(m), len(some))).mean
+    sent = problem.reflection.albedo[some][:, None].astype(np.float64) * light.reshape(len(some), m, 3)
+    return np.square(sent).sum(axis=(0, 2)) * len(ids) / len(some)
 
 
 def _paths_needed(
-    found: Estimate, albedo: Floats, levels: list[scipy.sparse.csr_array], target: float, spp: int
+    found: Estimate,
+    albedo: Floats,
+    sent: Doubles,
+    levels: list[scipy.sparse.csr_array],
+    target: float,
+    spp: int,
 ) -> NDArray[np.int64]:
-    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in the light of its lamp.
+    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in all light of its lamp.
 
-    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most.
+    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most. Direct light has the
+    energy ``sent`` (m,).
     """
     n, seen = len(albedo), spp // PILOT
     light, variance = (x.reshape(n, -1, x.shape[1] // 3, 3) for x in (found.mean, found.variance))
     flat = (*light.shape[:2], -1)
     left = noise_left(light.reshape(flat), variance.reshape(flat), levels).reshape(light.shape)
     power = np.square(albedo.astype(np.float64))[:, None]
-    energy = (power * (np.square(light.sum(axis=2)) - variance.sum(axis=2))).sum(axis=(0, 2))
-    before, after = (
-        seen * (power * x.sum(axis=2)).sum(axis=2) for x in (variance, left)
-    )  # of one path (n, m)
+    reflected = (power * (np.square(light.sum(axis=2)) - variance.sum(axis=2))).sum(axis=(0, 2))
+    # variance of one path, (n, m), without smoothing and with it
+    before, after = (seen * (power * x.sum(axis=2)).sum(axis=2) for x in (variance, left))
     least = np.full(light.shape[1], spp)
-    for lamp, enough in enumerate(target**2 * energy):
+    for lamp, enough in enumerate(target**2 * (sent + np.maximum(reflected, 0))):
         if 0 < after[:, lamp].sum() / seen <= enough:
             least[lamp] = 0
             continue
