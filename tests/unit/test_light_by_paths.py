@@ -152,8 +152,8 @@ def test_few_paths_where_they_are_enough(problem):
 def test_noise_of_lamps_is_brought_below_a_target(problem):
     """Rationale: which numbers of paths are enough is predicted by some, after smoothing.
 
-    Expected: a looser target takes fewer paths; what is left is within 1.5 times of the target, of all light of each lamp;
-    the least target takes all paths.
+    Expected: a looser target takes fewer paths; what is left is within 1.5 times of the target, of all light of each
+    lamp; the least target takes all paths.
     Result: 16, 78 and 101 paths of an element leave 10 and 6, 6.1 and 3.3, 6.1 and 3.0%; the truth has 1.7% of noise.
     """
     n, m = problem.scene.n_vertices, problem.emission.size
