@@ -96,7 +96,7 @@ def precompute(
         starts with 64 rays per vertex, four times as many. The report counts all that was evaluated on the way. For
         ``"brute_force"`` the pilot chooses the cheapest ``indirect_resolution`` and ``spp``, in place of those given.
         Of lamps, where paths are traced: the elements of a lamp have fewer paths than ``spp`` if so much noise is left
-        by them in its light. A warning says if the held-out error shows that the target was missed.
+        by them in its indirect light. A warning says if the held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices. What ``"auto"``
         chooses depends on measured times as well.

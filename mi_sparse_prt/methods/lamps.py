@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.sparse_product import multiply_scaled
 from mi_sparse_prt.methods.result import MethodResult
@@ -25,14 +24,8 @@ from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 
-Ids: TypeAlias = NDArray[np.int64]
-Doubles: TypeAlias = NDArray[np.float64]
-
 BLOCK = 4096  # points at a time
 NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct light together with it
-SAMPLE = 2048  # points whose direct light is looked at
-FEW = 4  # strata per axis of a lamp, of their shadow rays
-SAMPLED = 15  # spawn key
 SPP = 64  # paths of an element, where nothing else says how many
 
 
@@ -81,8 +74,8 @@ def path_traced_lamps(
     """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
 
     Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if by these the error is about as
-    much, relative L2 of all light of the lamp. Of more than 65,536 vertices only nodes have paths. See
+    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if by these the error of the
+    indirect light of the lamp is about as much, relative L2. Of more than 65,536 vertices only nodes have paths. See
     ``gathered_lamps``.
     """
     direct, indirect, skipped = None, None, list[str]()
@@ -115,15 +108,10 @@ def _by_paths(
             nodes = choose_nodes(problem.scene, points)
             ids, levels = nodes.ids, smoothing_levels(problem.scene, points, nodes.ids)
         if target is not None:
-            albedo, spp, sent = (
-                problem.reflection.albedo[ids],
-                effort.spp,
-                _energy_sent(problem, ids, run.seed),
-            )
+            albedo, spp = problem.reflection.albedo[ids], effort.spp
             # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
-            share = target / 2
             effort = effort._replace(
-                needed=lambda found: _paths_needed(found, albedo, sent, levels, share, spp)
+                needed=lambda found: _paths_needed(found, albedo, levels, target / 2, spp)
             )
     with run.clock.phase("indirect"), run.bar(len(ids) * m, "indirect") as bar:
         asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
@@ -137,27 +125,17 @@ def _by_paths(
         return np.maximum(nodes.interpolate(smooth), 0).reshape(len(points), m, -1), count, saved
 
 
-def _energy_sent(problem: Problem, ids: Ids, seed: int) -> Doubles:
-    """Squares (m,) of what points send on of direct light of each lamp, summed over them: about, from some of these."""
-    m, rng = problem.emission.size, np.random.default_rng(random_stream(seed, SAMPLED))
-    some = rng.permutation(ids)[:SAMPLE]
-    light = LampRays(problem, FEW, seed).elements(np.repeat(some, m), np.tile(np.arange(m), len(some))).mean
-    sent = problem.reflection.albedo[some][:, None].astype(np.float64) * light.reshape(len(some), m, 3)
-    return np.square(sent).sum(axis=(0, 2)) * len(ids) / len(some)
-
-
 def _paths_needed(
     found: Estimate,
     albedo: Floats,
-    sent: Doubles,
     levels: list[scipy.sparse.csr_array],
     target: float,
     spp: int,
 ) -> NDArray[np.int64]:
-    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in all light of its lamp.
+    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in the light of its lamp.
 
-    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most. Direct light has the
-    energy ``sent`` (m,).
+    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most. Noise is relative to
+    indirect light alone: a camera may look at places that no lamp lights directly.
     """
     n, seen = len(albedo), spp // PILOT
     light, variance = (x.reshape(n, -1, x.shape[1] // 3, 3) for x in (found.mean, found.variance))
@@ -168,7 +146,7 @@ def _paths_needed(
     # variance of one path, (n, m), without smoothing and with it
     before, after = (seen * (power * x.sum(axis=2)).sum(axis=2) for x in (variance, left))
     least = np.full(light.shape[1], spp)
-    for lamp, enough in enumerate(target**2 * (sent + np.maximum(reflected, 0))):
+    for lamp, enough in enumerate(target**2 * reflected):
         if 0 < after[:, lamp].sum() / seen <= enough:
             least[lamp] = 0
             continue

@@ -83,7 +83,7 @@ class SparsePRT(mi.SamplingIntegrator):
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the environment's matrix to aim at, and of the noise that may
-                                   be left in the light of lamps. (0: that of ``prt.precompute``)
+                                   be left in the indirect light of lamps. (0: that of ``prt.precompute``)
     specular_error      float      Noise of light by way of mirrors and glass that is small enough, of that light alone.
                                    (0: it is part of ``target_error``)
     max_seconds         float      ``auto`` begins nothing that is predicted to take longer. (300)
