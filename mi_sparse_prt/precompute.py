@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
@@ -95,8 +96,8 @@ def precompute(
         predictions; of ``"sparse"``, that starts with 5% of the vertices dense, twice as many; of ``"gather"``, that
         starts with 64 rays per vertex, four times as many. The report counts all that was evaluated on the way. For
         ``"brute_force"`` the pilot chooses the cheapest ``indirect_resolution`` and ``spp``, in place of those given.
-        Of lamps, where paths are traced: the elements of a lamp have fewer paths than ``spp`` if so much noise is left
-        by them in its indirect light. A warning says if the held-out error shows that the target was missed.
+        Lamps whose indirect light has little noise by fewer paths than ``spp`` have fewer. A warning says if the
+        held-out error shows that the target was missed.
     seed : int
         Same seed, same matrix, whatever the block size, the thread count or the order of vertices. What ``"auto"``
         chooses depends on measured times as well.
@@ -368,24 +369,20 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         _warn_if_glossy(problem.scene, "a matrix of lamps has no terms")
     settings, method = replace(settings, terms=0), settings.method
     seen = not isinstance(problem.emission, UnitLamps)  # pictures find the light that lamps send on directly
-    by_paths = method == "brute_force" or (method == "auto" and not problem.scene.diffuse)
-    if by_paths:
-        settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
+    target: float | None = settings.target_error
+    attempts: Iterable[MethodResult]
+    if method == "gather" or (method == "auto" and problem.scene.diffuse):
+        settings, attempts = replace(settings, method="gather"), [gathered_lamps(problem, run, seen=seen)]
     else:
-        settings = replace(settings, method="gather")
-    for target in dict.fromkeys(
-        (settings.target_error, None)
-    ):  # what a target saves is done if it was missed
-        if by_paths:
-            parts = path_traced_lamps(problem, run, settings.samples, target, seen=seen)
-        else:
-            parts = gathered_lamps(problem, run, seen=seen)
+        settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
+        attempts = path_traced_lamps(problem, run, settings.samples, target, seen=seen)
+    for parts in attempts:
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
             error = held_out_lamp_error(problem, transport, run.seed)
-        if not parts.skipped or target is None or error.total - 2 * error.standard_error["total"] <= target:
+        if target is None or error.total - 2 * error.standard_error["total"] <= target:
             break
-    if settings.target_error is not None:
+    if target is not None:
         _warn_if_missed(error, settings, None)
     transport.report.update(
         _account(parts, problem, [])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.element_sampling import draw_by_energy
 from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
-from mi_sparse_prt.solvers.lamps import LampRays, PathEffort, light_by_paths
+from mi_sparse_prt.solvers.lamps import LampRays, LightByPaths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
 from mi_sparse_prt.transport import LightTransport
@@ -74,7 +74,7 @@ def _true(problem: Problem, asked: tuple[Any, Any], seen: bool, rays: int, paths
     sent = LampRays(problem, 16, rays).elements(*asked).mean.astype(np.float64)
     if problem.max_depth == 2:
         return _True(sent, sent)
-    reflected = light_by_paths(problem, *asked, PathEffort(SPP, paths))[0].mean.astype(np.float64)
+    reflected = LightByPaths(problem, *asked, SPP, paths).estimate().mean.astype(np.float64)
     if not seen:
         return _True(reflected, sent + reflected)
     every = sent + reflected + _by_mirrors(problem, asked, rays)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -18,14 +19,16 @@ from mi_sparse_prt.operators.operator import Floats, Operator
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reconstruction.surface_smoothing import noise_left, smooth_light, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.lamps import PILOT, LampRays, PathEffort, light_by_paths, shared_out
+from mi_sparse_prt.solvers.lamps import PILOT, LampRays, LightByPaths, shared_out
 from mi_sparse_prt.solvers.paths import Estimate
 from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
+from mi_sparse_prt.solvers.surface_nodes import Nodes
 
 BLOCK = 4096  # points at a time
 NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct light together with it
+FEWER = "paths of some lamps: fewer than {} of an element, as the target error asks for no more"
 SPP = 64  # paths of an element, where nothing else says how many
 
 
@@ -70,69 +73,78 @@ def path_traced_lamps(
     target: float | None = None,
     strata: int = 16,
     seen: bool = True,
-) -> MethodResult:
+) -> Iterator[MethodResult]:
     """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
 
     Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. With a ``target``, the elements of a lamp have fewer paths if by these the error of the
-    indirect light of the lamp is about as much, relative L2. Of more than 65,536 vertices only nodes have paths. See
-    ``gathered_lamps``.
+    and meet them as well. In scenes of more than 65,536 vertices paths start at nodes, between which light is
+    interpolated. With a ``target``, lamps of whose indirect light fewer paths leave so little noise (relative L2) have
+    fewer; such a result says so in ``skipped``, and a next one, by ``spp`` paths, follows. See ``gathered_lamps``.
     """
-    direct, indirect, skipped = None, None, list[str]()
-    rays: dict[str, int] = {}
-    if seen:
-        direct, rays = _direct(problem, run, strata)
-    if problem.max_depth != 2:
-        apart, effort = (
-            0 if problem.scene.diffuse else told_apart(problem.max_depth),
-            PathEffort(spp, run.seed),
-        )
-        light, rays["indirect_paths"], saved = _by_paths(problem, run, effort, target, max(apart, 1))
-        indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
-        if saved:
-            skipped.append(f"paths: fewer than {spp} of an element, as the target error asks for no more")
-    return replace(_result(direct, indirect, rays), skipped=skipped)
-
-
-def _by_paths(
-    problem: Problem, run: Run, effort: PathEffort, target: float | None, apart: int
-) -> tuple[Floats, int, bool]:
-    """Indirect light (n, m, 3 * apart), how many paths found it, and if these were fewer than without a target.
-
-    Of many vertices some have paths, and others are between them.
-    """
-    points, m = problem.points, problem.emission.size
-    ids, nodes = np.arange(len(points)), None
-    if problem.at_vertices is problem:
-        with run.clock.phase("smoothing"):
-            nodes = choose_nodes(problem.scene, points)
-            ids, levels = nodes.ids, smoothing_levels(problem.scene, points, nodes.ids)
-        if target is not None:
-            albedo, spp = problem.reflection.albedo[ids], effort.spp
-            # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
-            effort = effort._replace(
-                needed=lambda found: _paths_needed(found, albedo, levels, target / 2, spp)
-            )
-    with run.clock.phase("indirect"), run.bar(len(ids) * m, "indirect") as bar:
-        asked = np.repeat(ids, m), np.tile(np.arange(m), len(ids))
-        found, count = light_by_paths(problem, *asked, effort, bar.update, apart)
-    light, variance = (x.reshape(len(ids), m, -1) for x in (found.mean, found.variance))
-    saved = target is not None and count < len(asked[0]) * (effort.spp + effort.spp // PILOT)
-    if nodes is None:
-        return light, count, False
+    direct, rays = _direct(problem, run, strata) if seen else (None, {})
+    if problem.max_depth == 2:
+        yield _result(direct, None, rays)
+        return
+    m, apart = problem.emission.size, 0 if problem.scene.diffuse else told_apart(problem.max_depth)
     with run.clock.phase("smoothing"):
-        smooth = smooth_light(light, variance, levels).reshape(len(ids), -1)
-        return np.maximum(nodes.interpolate(smooth), 0).reshape(len(points), m, -1), count, saved
+        places = _places(problem)
+    asked = np.repeat(places.ids, m), np.tile(np.arange(m), len(places.ids))
+    paths = LightByPaths(problem, *asked, spp, run.seed, max(apart, 1))
+    every, least = np.full(len(asked[0]), spp), None
+    with run.clock.phase("indirect"):
+        first = paths.first
+    if target is not None and places.levels and first is not None:
+        # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
+        albedo = problem.reflection.albedo[places.ids]
+        least = _paths_needed(first, albedo, places.levels, target / 2, spp)
+    for counts in (every,) if least is None or (least == spp).all() else (least, every):
+        with run.clock.phase("indirect"), run.bar(len(every), "indirect") as bar:
+            found = paths.estimate(counts, bar.update)
+        with run.clock.phase("smoothing"):
+            light = places.light(found, m)
+        indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
+        result = _result(direct, indirect, rays | {"indirect_paths": paths.traced})
+        yield replace(result, skipped=[FEWER.format(spp)] if counts is least else [])
+
+
+class _Places(NamedTuple):
+    """Points at which paths start.
+
+    Attributes
+    ----------
+    ids : (n,) int64
+    nodes : Nodes, optional
+        These, if they are among vertices.
+    levels : list of (n, n) sparse float32
+        As of ``smoothing_levels``; none where points are no vertices.
+    """
+
+    ids: NDArray[np.int64]
+    nodes: Nodes | None
+    levels: list[scipy.sparse.csr_array]
+
+    def light(self, found: Estimate, m: int) -> Floats:
+        """Light (points, m, k) of all points, from that of m lamps (n * m, k): smoothed, and interpolated."""
+        light, variance = (x.reshape(len(self.ids), m, -1) for x in (found.mean, found.variance))
+        if self.nodes is None:
+            return light
+        smooth = smooth_light(light, variance, self.levels).reshape(len(light), -1)
+        every = self.nodes.interpolate(smooth)
+        return np.maximum(every, 0).reshape(len(every), *light.shape[1:])
+
+
+def _places(problem: Problem) -> _Places:
+    """All points; of vertices, if they are many, nodes."""
+    if problem.at_vertices is not problem:
+        return _Places(np.arange(len(problem.points)), None, [])
+    nodes = choose_nodes(problem.scene, problem.points)
+    return _Places(nodes.ids, nodes, smoothing_levels(problem.scene, problem.points, nodes.ids))
 
 
 def _paths_needed(
-    found: Estimate,
-    albedo: Floats,
-    levels: list[scipy.sparse.csr_array],
-    target: float,
-    spp: int,
+    found: Estimate, albedo: Floats, levels: list[scipy.sparse.csr_array], target: float, spp: int
 ) -> NDArray[np.int64]:
-    """Paths of each element (n * m,), at least, after which smoothing leaves so much noise in the light of its lamp.
+    """Paths of each element (n * m,), at least, after which smoothing leaves so little noise in the light of its lamp.
 
     ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most. Noise is relative to
     indirect light alone: a camera may look at places that no lamp lights directly.

@@ -12,7 +12,7 @@ from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.reflection.reflection import Diffuse
-from mi_sparse_prt.solvers.lamps import LampRays, PathEffort, light_by_paths
+from mi_sparse_prt.solvers.lamps import LampRays, LightByPaths
 from mi_sparse_prt.solvers.problem import Problem
 
 FLOOR = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.8}}
@@ -102,7 +102,7 @@ def test_the_error_of_a_matrix_of_lamps_next_to_surfaces_is_told():
     n = scene.n_vertices
     every = np.arange(n), np.zeros(n, int)
     direct = LampRays(problem, 64, 1).elements(*every).mean
-    indirect = light_by_paths(problem, *every, PathEffort(4096, 2))[0].mean
+    indirect = LightByPaths(problem, *every, 4096, 2).estimate().mean
     right = direct + indirect
     rng = np.random.default_rng(3)
     off = rng.choice([-1.0, 1.0], n)[:, None] * np.where(scene.positions[:, 1] > 0.01, 0.3, 0.1)[:, None]
