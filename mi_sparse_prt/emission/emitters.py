@@ -177,16 +177,34 @@ class SceneEmitters:
         self, element: mi.UInt32, position: mi.Point3f, uv: mi.Point2f
     ) -> tuple[mi.Vector3f, mi.Color3f, mi.Float, mi.Float]:
         """One direction in which light of an element arrives, see ``EmissionSpace.sample``."""
-        count = dr.gather(mi.UInt32, self._count, element)
-        u = uv.x * mi.Float(count)
-        which = dr.minimum(mi.UInt32(u), count - 1)
-        number = dr.gather(mi.UInt32, self._emitters, dr.gather(mi.UInt32, self._first, element) + which)
-        emitter = dr.gather(mi.EmitterPtr, self._scene.emitters_dr(), number)
+        emitter, count, u = self._one_of(element, uv.x)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
         si.p = position
-        found, weight = emitter.sample_direction(si, mi.Point2f(u - mi.Float(which), uv.y), mi.Mask(True))
+        found, weight = emitter.sample_direction(si, mi.Point2f(u, uv.y), mi.Mask(True))
         density = dr.select(found.delta, 0, found.pdf / mi.Float(count))
         return found.d, mi.Color3f(weight) * mi.Float(count), found.dist, density
+
+    @property
+    def emitted(self) -> NDArray[np.int64]:
+        """Columns (k,) of lamps alone, whose light ``emit`` sends into the scene; ascending."""
+        distant = [emitter.is_environment() for emitter in self._scene.emitters()]
+        return np.flatnonzero([not any(distant[number] for number in own) for own in self._members])
+
+    def emit(
+        self, element: mi.UInt32, u: mi.Float, place: mi.Point2f, towards: mi.Point2f
+    ) -> tuple[mi.Ray3f, mi.Color3f]:
+        """Rays of light that leaves an element, see ``EmittedLight.emit``."""
+        emitter, count, u = self._one_of(element, u)
+        ray, weight = emitter.sample_ray(0.0, u, place, towards, mi.Mask(True))
+        return mi.Ray3f(ray), mi.Color3f(weight) * mi.Float(count)
+
+    def _one_of(self, element: mi.UInt32, u: mi.Float) -> tuple[mi.EmitterPtr, mi.UInt32, mi.Float]:
+        """One of an element's emitters, how many these are, and what is left of a random number."""
+        count = dr.gather(mi.UInt32, self._count, element)
+        u = u * mi.Float(count)
+        which = dr.minimum(mi.UInt32(u), count - 1)
+        number = dr.gather(mi.UInt32, self._emitters, dr.gather(mi.UInt32, self._first, element) + which)
+        return dr.gather(mi.EmitterPtr, self._scene.emitters_dr(), number), count, u - mi.Float(which)
 
     def element_of(
         self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Mask

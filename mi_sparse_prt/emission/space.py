@@ -131,3 +131,29 @@ class SampledEmission(EmissionSpace, Protocol):
         -------
         Float
         """
+
+
+class EmittedLight(SampledEmission, Protocol):
+    """A basis whose light can be followed from where it leaves lamps: indirect light has less noise then."""
+
+    @property
+    def emitted(self) -> NDArray[np.int64]:
+        """Elements (k,) that ``emit`` knows, ascending; not those of distant light, most of which misses a scene."""
+
+    def emit(self, element: Any, u: Any, place: Any, towards: Any, /) -> tuple[Any, Any]:
+        """Rays of light that leaves an element, on the device.
+
+        Parameters
+        ----------
+        element : UInt32
+        u : Float
+            In [0, 1).
+        place, towards : Point2f
+            In [0, 1)^2.
+
+        Returns
+        -------
+        ray : Ray3f, world
+        power : Color3f
+            If the element has the coefficient 1, over the density of the sample: its mean is the flux that leaves.
+        """

@@ -16,10 +16,11 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.operators.by_depth import ByDepth
 from mi_sparse_prt.operators.dense import Dense
 from mi_sparse_prt.operators.operator import Floats, Operator
+from mi_sparse_prt.reconstruction.lamp_light import LampLight
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
-from mi_sparse_prt.reconstruction.surface_smoothing import noise_left, smooth_light, smoothing_levels
+from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_levels
 from mi_sparse_prt.solvers.form_factors import gather_matrix
-from mi_sparse_prt.solvers.lamps import PILOT, LampRays, LightByPaths, shared_out
+from mi_sparse_prt.solvers.lamps import LampRays
 from mi_sparse_prt.solvers.paths import Estimate
 from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
@@ -74,10 +75,10 @@ def path_traced_lamps(
     strata: int = 16,
     seen: bool = True,
 ) -> Iterator[MethodResult]:
-    """By path tracing: any BSDF; ``spp`` paths of an element at least, whose noise is averaged out along surfaces.
+    """By paths and photons: any BSDF; at least ``spp`` paths of an element, or as many photons; noise is averaged out.
 
     Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. In scenes of more than 65,536 vertices paths start at nodes, between which light is
+    and meet them as well. In scenes of more than 65,536 vertices light is found at nodes, between which it is
     interpolated. With a ``target``, lamps of whose indirect light fewer paths leave so little noise (relative L2) have
     fewer; such a result says so in ``skipped``, and a next one, by ``spp`` paths, follows. See ``gathered_lamps``.
     """
@@ -88,27 +89,23 @@ def path_traced_lamps(
     m, apart = problem.emission.size, 0 if problem.scene.diffuse else told_apart(problem.max_depth)
     with run.clock.phase("smoothing"):
         places = _places(problem)
-    asked = np.repeat(places.ids, m), np.tile(np.arange(m), len(places.ids))
-    paths = LightByPaths(problem, *asked, spp, run.seed, max(apart, 1))
-    every, least = np.full(len(asked[0]), spp), None
     with run.clock.phase("indirect"):
-        first = paths.first
-    if target is not None and places.levels and first is not None:
+        light = LampLight(problem, places.ids, places.nodes, places.levels, spp, run.seed, max(apart, 1))
         # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
-        albedo = problem.reflection.albedo[places.ids]
-        least = _paths_needed(first, albedo, places.levels, target / 2, spp)
-    for counts in (every,) if least is None or (least == spp).all() else (least, every):
-        with run.clock.phase("indirect"), run.bar(len(every), "indirect") as bar:
-            found = paths.estimate(counts, bar.update)
+        least = None if target is None else light.effort(target / 2)
+    every = np.full(m, spp)
+    for effort in (every,) if least is None or (least == spp).all() else (least, every):
+        with run.clock.phase("indirect"), run.bar(len(places.ids) * m, "indirect") as bar:
+            found = light.estimate(effort, bar.update)
         with run.clock.phase("smoothing"):
-            light = places.light(found, m)
-        indirect = Dense(light) if apart == 0 else _by_depth(light, apart)
-        result = _result(direct, indirect, rays | {"indirect_paths": paths.traced})
-        yield replace(result, skipped=[FEWER.format(spp)] if counts is least else [])
+            every_light = places.light(found, m)
+        indirect = Dense(every_light) if apart == 0 else _by_depth(every_light, apart)
+        result = _result(direct, indirect, rays | light.rays)
+        yield replace(result, skipped=[FEWER.format(spp)] if effort is least else [])
 
 
 class _Places(NamedTuple):
-    """Points at which paths start.
+    """Points at which light is found.
 
     Attributes
     ----------
@@ -139,34 +136,6 @@ def _places(problem: Problem) -> _Places:
         return _Places(np.arange(len(problem.points)), None, [])
     nodes = choose_nodes(problem.scene, problem.points)
     return _Places(nodes.ids, nodes, smoothing_levels(problem.scene, problem.points, nodes.ids))
-
-
-def _paths_needed(
-    found: Estimate, albedo: Floats, levels: list[scipy.sparse.csr_array], target: float, spp: int
-) -> NDArray[np.int64]:
-    """Paths of each element (n * m,), at least, after which smoothing leaves so little noise in the light of its lamp.
-
-    ``found`` is by ``spp // PILOT`` paths of each; 0 where these are enough, and ``spp`` at most. Noise is relative to
-    indirect light alone: a camera may look at places that no lamp lights directly.
-    """
-    n, seen = len(albedo), spp // PILOT
-    light, variance = (x.reshape(n, -1, x.shape[1] // 3, 3) for x in (found.mean, found.variance))
-    flat = (*light.shape[:2], -1)
-    left = noise_left(light.reshape(flat), variance.reshape(flat), levels).reshape(light.shape)
-    power = np.square(albedo.astype(np.float64))[:, None]
-    reflected = (power * (np.square(light.sum(axis=2)) - variance.sum(axis=2))).sum(axis=(0, 2))
-    # variance of one path, (n, m), without smoothing and with it
-    before, after = (seen * (power * x.sum(axis=2)).sum(axis=2) for x in (variance, left))
-    least = np.full(light.shape[1], spp)
-    for lamp, enough in enumerate(target**2 * reflected):
-        if 0 < after[:, lamp].sum() / seen <= enough:
-            least[lamp] = 0
-            continue
-        for few in (seen // 2, seen, 2 * seen):
-            if 0 < (after[:, lamp] / shared_out(before[:, lamp], seen, few)).sum() <= enough:
-                least[lamp] = few
-                break
-    return np.tile(least, n)
 
 
 def _direct(problem: Problem, run: Run, strata: int) -> tuple[Floats, dict[str, int]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 
 
@@ -28,6 +30,12 @@ class EvenTexture(mi.Texture):
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Mask = True) -> mi.Color3f:
         """The texture's own value."""
         return self._texture.eval(si, active)
+
+    def sample_spectrum(
+        self, si: mi.SurfaceInteraction3f, sample: Any, active: mi.Mask = True
+    ) -> tuple[Any, mi.Color3f]:
+        """The texture's own value, for photons."""
+        return self._texture.sample_spectrum(si, sample, active)
 
     def mean(self) -> mi.Float:
         """The texture's own."""

@@ -250,6 +250,10 @@ class Scene:
         """Points of the normalised frame in world space, on the device."""
         return p / self.scale + mi.Point3f(*map(float, self.centre))
 
+    def from_world(self, p: mi.Point3f) -> mi.Point3f:
+        """Points of world space in the normalised frame, on the device."""
+        return (p - mi.Point3f(*map(float, self.centre))) * self.scale
+
     def shape_in_world(self, shape: mi.ShapePtr, active: mi.Mask) -> mi.ShapePtr:
         """The shapes of ``mitsuba``, which have emitters, in place of those of ``normalised`` or ``unsplit``.
 

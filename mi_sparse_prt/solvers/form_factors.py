@@ -7,6 +7,7 @@ tile is a millimetre before it. There a ray goes on, by chance as the surface re
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -129,6 +130,7 @@ class Surfaces:
         self._hidden = hidden_corners(scene)
         self._backs = mi.UInt32(np.where(scene.backs < 0, NOTHING, scene.backs).astype(np.uint32))
         self._positions = mi.Point3f(vertex_points(scene).positions.T)
+        self._normalised_positions = scene.normalised_positions
         self._albedo = mi.Float(scene.albedo.mean(axis=1))
         self._most = MOST_IN_GAP if max_depth < 0 else min(max(max_depth - 3, 0), MOST_IN_GAP)
         self._endless = max_depth < 0
@@ -241,6 +243,12 @@ class Surfaces:
             passed = dr.sum(mi.Color3f(si.bsdf().eval_null_transmission(si, valid))) / 3
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
+        return self.corner_met(hit, ray, u, valid)
+
+    def corner_met(
+        self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float, valid: mi.Mask
+    ) -> mi.UInt32:
+        """The same, whether or not light goes straight on."""
         triangle = self._scene.triangle(hit, valid)
         corners = [dr.gather(mi.UInt32, self._triangles, 3 * triangle + k, valid) for k in range(3)]
         b = hit.prim_uv.x, hit.prim_uv.y
@@ -256,6 +264,38 @@ class Surfaces:
         chosen = dr.select(k == 1, corners[1], dr.select(k == 2, corners[2], corners[0]))
         chosen = dr.select(front, chosen, dr.gather(mi.UInt32, self._backs, chosen, valid & ~front))
         return dr.select(valid, chosen, NOTHING)
+
+    @cached_property
+    def _places(self) -> mi.Vector3f:
+        """Of corners themselves, off which rows of vertices may start a little."""
+        return mi.Vector3f(self._normalised_positions.T)
+
+    def corners_above(
+        self, triangle: mi.UInt32, side: mi.Float, rng: mi.PCG32
+    ) -> tuple[mi.UInt32, mi.UInt32]:
+        """A corner, on a side, of each triangle by a random place on it; and that which a ray to there finds.
+
+        The ray comes from half of the way to what the place sees in a random direction. It finds another corner where a
+        wall hides the first, and NOTHING if it meets another surface, as it may where one lies on the triangle.
+        """
+        corners = [dr.gather(mi.UInt32, self._triangles, 3 * triangle + k) for k in range(3)]
+        p, n = (
+            [dr.gather(mi.Vector3f, x, corner) for corner in corners] for x in (self._places, self._normals)
+        )
+        uv = mi.warp.square_to_uniform_triangle(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        b = 1 - uv.x - uv.y, uv.x, uv.y
+        place, shading = (x[0] * b[0] + x[1] * b[1] + x[2] * b[2] for x in (p, n))
+        normal = side * dr.normalize(dr.cross(p[1] - p[0], p[2] - p[0]))
+        uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(uv))
+        seen = self._scene.ray_intersect_preliminary(mi.Ray3f(dr.fma(normal, ray_offset(place), place), way))
+        ray = mi.Ray3f(dr.fma(way, dr.minimum(seen.t, 2) / 2, place), -way)
+        hit, u = self._scene.ray_intersect_preliminary(ray), rng.next_float32()
+        expected = dr.select(u < b[1], corners[1], dr.select(u < b[1] + b[2], corners[2], corners[0]))
+        front = dr.dot(shading, way) > 0
+        expected = dr.select(front, expected, dr.gather(mi.UInt32, self._backs, expected, ~front))
+        own = hit.is_valid() & (self._scene.triangle(hit, hit.is_valid()) == triangle)
+        return expected, self.corner_met(hit, ray, u, own)
 
 
 def cosine_rays(

@@ -12,6 +12,7 @@ from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.methods import lamps
 from mi_sparse_prt.methods.lamps import path_traced_lamps
 from mi_sparse_prt.methods.result import MethodResult
+from mi_sparse_prt.reconstruction.lamp_light import LampLight
 from mi_sparse_prt.reconstruction.node_placement import choose_nodes
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.solvers import lamps as lamp_solvers
@@ -248,7 +249,7 @@ def test_many_vertices_take_their_light_from_nodes(monkeypatch):
 
 def test_what_a_target_saves_is_done_if_it_is_missed(problem, monkeypatch):
     """Expected: where few paths seem enough and are not, the matrix is that without a target; all paths are counted."""
-    monkeypatch.setattr(lamps, "_paths_needed", lambda found, *_: np.zeros(len(found.mean), np.int64))
+    monkeypatch.setattr(LampLight, "effort", lambda self, target: np.zeros(problem.emission.size, np.int64))
     asked = {"method": "brute_force", "spp": 64, "progress": False}
     few, again, whole = (
         prt.precompute(problem.scene, problem.emission, **asked, **target)
@@ -256,6 +257,7 @@ def test_what_a_target_saves_is_done_if_it_is_missed(problem, monkeypatch):
     )
     paths = [matrix.report["rays"]["indirect_paths"] for matrix in (few, again, whole)]
     assert paths[0] < paths[1] == paths[2]  # the first paths tell how the others are shared out
+    assert few.report["rays"]["photons"] < whole.report["rays"]["photons"]
     np.testing.assert_array_equal(again.rows(np.arange(50)), whole.rows(np.arange(50)))
     assert any("fewer than 64" in line for line in few.report["skipped"])
 
