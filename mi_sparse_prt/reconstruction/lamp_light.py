@@ -154,8 +154,9 @@ class LampLight:
         """What photons count (n, m), if each lamp has so many paths of each element or as many photons."""
         split = np.broadcast_to(split, len(effort))
         paths, photons = self._each
-        known = (1 - split) / paths, split * len(paths) / photons
-        return (known[1] / (known[0] + known[1])).astype(np.float32)
+        others, known = (1 - split) / paths, split * len(paths) / photons
+        alone = known == 0  # where no photons arrive, paths count even if all that is traced are photons
+        return np.where(alone, 0, known / np.where(alone, 1, known + others)).astype(np.float32)
 
     def _combined(self, found: Sequence[Estimate], weights: Floats) -> Estimate:
         """Paths and photons, which count as much as weights (n, m) say."""

@@ -27,6 +27,7 @@ from mi_sparse_prt.core.random_keys import element_seeds, random_generator, rand
 from mi_sparse_prt.core.sparse_product import multiply_sparse
 from mi_sparse_prt.scene.materials import is_one_of, sample_weight
 from mi_sparse_prt.scene.ray_offsets import ray_offset
+from mi_sparse_prt.scene.triangle_mesh import unique_rows
 from mi_sparse_prt.solvers.form_factors import NOTHING, Surfaces
 from mi_sparse_prt.solvers.paths import Estimate
 from mi_sparse_prt.solvers.problem import Problem
@@ -35,8 +36,8 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 LANES = 1 << 21  # photons per wavefront
 PHOTONS = 13  # spawn key
 TRIED = 16  # places on each side of a triangle, at which it is looked whether photons arrive there
-# Of the area around a node, at least, on which photons arrive; where a surface lies on another, one of the two has none
-OPEN = 0.05
+OPEN = 0.05  # of the area around a node, at least, on which photons arrive
+ALIKE = 1e-3  # normals
 
 Doubles = NDArray[np.float64]
 
@@ -119,7 +120,9 @@ class LightTracing:
         return Estimate(mean.astype(np.float32), variance.astype(np.float32))
 
     def _of_nodes(self, values: Doubles, power: int) -> Doubles:
-        """Sums (n, k) at nodes of what arrived at vertices (n_v, k), by weights to a power."""
+        """Sums (n, k) at nodes of what arrived at vertices (n_v, k) and those alike, by weights to a power."""
+        together = [np.bincount(self._alike, column)[self._alike] for column in values.T]
+        values = np.stack(together, axis=1)
         if self._weights is None:
             return values
         weights = self._weights if power == 1 else self._weights.power(power)
@@ -141,11 +144,15 @@ class LightTracing:
         A third of the triangles' at each vertex, but where a wall hides corners of a triangle from a part of it, or
         another surface lies on it; infinite if next to nothing is left.
         """
-        whole = self._scene.vertex_areas.astype(np.float64)
-        arrives, tried = whole.copy(), np.zeros(len(whole))
-        for mesh in self._scene.meshes:
-            np.add.at(tried, mesh.triangles + mesh.vertices.start, TRIED / 3)
-        for expected, found, area in self._taken_elsewhere():
+        corners, layers = self._corners, self._layers
+        p = self._scene.positions[corners].astype(np.float64)
+        areas = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1) / 2
+        whole, tried = (
+            np.bincount(corners.ravel(), np.repeat(x / 3, 3), self._scene.n_vertices).astype(np.float64)
+            for x in (areas / layers, np.full(len(corners), float(TRIED)))
+        )
+        arrives = whole.copy()
+        for expected, found, area in self._taken_elsewhere(areas):
             for vertex, sign in ((expected, -1), (found, 1)):
                 known = vertex != NOTHING
                 np.add.at(arrives, vertex[known], sign * area[known])
@@ -154,25 +161,50 @@ class LightTracing:
         uncertain = np.maximum(1 - share, 0) / np.maximum(share * tried, 1e-30)
         return np.where(share > OPEN, np.pi * arrives, np.inf), uncertain
 
-    def _taken_elsewhere(self) -> Iterator[tuple[NDArray[np.uint32], NDArray[np.uint32], Doubles]]:
-        """Pieces of surface whose photons are not counted at the corner that is to be expected, and where they are."""
-        surfaces, scene = self._surfaces, self._scene
-        triangles = np.concatenate([mesh.triangles + mesh.vertices.start for mesh in scene.fronts])
-        corners = scene.positions[triangles].astype(np.float64)
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    @cached_property
+    def _corners(self) -> NDArray[np.int64]:
+        """Vertices (t, 3) of the triangles of all sheets, fronts first."""
+        return np.concatenate([mesh.triangles + mesh.vertices.start for mesh in self._scene.meshes])
+
+    @cached_property
+    def _alike(self) -> NDArray[np.int64]:
+        """Numbers (n_v,) of vertices, the same of those at one place that face one way.
+
+        At seams they part what arrives. Of walls that have a face each way at the same place, rays meet either.
+        """
+        normals = np.rint(self._scene.normals / ALIKE)
+        return unique_rows(np.column_stack([self._scene.positions, normals]))[1]
+
+    @cached_property
+    def _layers(self) -> NDArray[np.int64]:
+        """How many triangles lie on each other (t,)."""
+        every = unique_rows(np.sort(self._alike[self._corners], axis=1))[1]
+        return np.bincount(every)[every]
+
+    def _taken_elsewhere(
+        self, areas: Doubles
+    ) -> Iterator[tuple[NDArray[np.uint32], NDArray[np.uint32], Doubles]]:
+        """Pieces of surface whose photons are not counted at the corner that is to be expected, and where they are.
+
+        But of triangles that lie on each other as wholes: these share what arrives.
+        """
+        fronts = sum(len(mesh.triangles) for mesh in self._scene.fronts)
+        triangles = np.flatnonzero(self._layers[:fronts] == 1).astype(np.uint32)
         for side in (1, -1):
             for a in range(0, len(triangles), LANES // TRIED):
                 count = min(LANES // TRIED, len(triangles) - a)
                 lane = dr.arange(mi.UInt32, TRIED * count)
-                triangle = lane // TRIED + dr.opaque(mi.UInt32, a)
+                those = mi.UInt32(triangles[a : a + count])
+                triangle = dr.gather(mi.UInt32, those, lane // TRIED)
                 rng = random_generator(mi.UInt64(triangle), lane % TRIED, mi.UInt32(0), PHOTONS)
-                expected, found = surfaces.corners_above(triangle, mi.Float(side), rng)
+                expected, found = self._surfaces.corners_above(triangle, mi.Float(side), rng)
                 dr.eval(expected, found)
                 index = dr.compress(expected != found)
                 if len(index):
-                    those = dr.gather(mi.UInt32, triangle, index).numpy()
-                    vertices = (dr.gather(mi.UInt32, x, index).numpy() for x in (expected, found))
-                    yield (*vertices, areas[those] / (2 * TRIED))
+                    which, *vertices = (
+                        dr.gather(mi.UInt32, x, index).numpy() for x in (triangle, expected, found)
+                    )
+                    yield (*vertices, areas[which] / TRIED)
 
     def _arrivals(
         self, lamp: int, count: int, seed: int
