@@ -282,7 +282,7 @@ class _Pilot:
     def __init__(self, direct: DirectSolver, vertices: NDArray[np.integer]) -> None:
         scene = direct.problem.scene
         self._scene, self._direct, self._vertices = scene, direct, vertices
-        self._albedo = scene.albedo[:, : 1 if scene.grey else 3]
+        self._albedo = scene.sent_albedo[:, : 1 if scene.grey else 3]
 
     def rays(self, count: int, seed: int) -> scipy.sparse.csr_array:
         """Rows of G."""

@@ -48,7 +48,7 @@ class GatherNoise:
         rays = min(rays, OTHERS)
         self._others = gather_matrix(scene, points, rays, other, ids, problem.max_depth)
         self.rays = rays * len(ids)
-        self._albedo = scene.albedo.mean(axis=1)[None]
+        self._albedo = scene.sent_albedo.mean(axis=1)[None]
         self._smoothing = SurfaceSmoothing(smoothing_levels(scene, points, ids))
         self._chosen: NDArray[np.int8] | None = None
 

@@ -129,6 +129,8 @@ class Material:
         A bump or normal map turns its shading normals.
     two_sided : bool
         It reflects light on its back, too, by more than a mirror's single direction.
+    scatters_through : bool
+        Some light goes through it into all directions: curtains, leaves.
     passes_light : bool
         Some light goes through it.
     single_directions : bool
@@ -169,6 +171,7 @@ class Material:
         self.glossy = bool(flags & int(mi.BSDFFlags.Glossy))
         spread = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
         self.known_by_irradiance = not (flags & int(spread) or self.bends_normals)
+        self.scatters_through = bool(flags & int(mi.BSDFFlags.DiffuseTransmission))
         self.passes_light = bool(flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null))
         self.single_directions = bool(flags & int(mi.BSDFFlags.Delta))
         self.rough_glass = bool(flags & int(mi.BSDFFlags.GlossyTransmission))
@@ -216,6 +219,32 @@ class Material:
         Of a mask, that of what it covers: vertices know nothing of the holes between them. Of rough glass 0.
         Each vertex is looked at in the corner of one of its triangles, from the direction of its normal.
         """
+        covered, si = _covered(self.bsdf), self._looked_at(shape, mesh)
+        if self.rough_glass:
+            value = mi.Color3f(0)
+        elif _lambertian(covered):
+            value = covered.eval_diffuse_reflectance(si)
+        else:
+            value = self._directional_albedo(covered, si, self._side)
+        albedo = np.array(dr.zeros(mi.Color3f, len(mesh.positions)) + value, dtype=np.float32).T.copy()
+        bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
+        if bad.size:
+            raise PrtError(
+                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} "
+                f"({bad.size} such vertices): reflectance must lie in 0..1"
+            )
+        return np.ascontiguousarray(np.minimum(albedo, 1))
+
+    def transmittance(self, shape: mi.Mesh, mesh: TriangleMesh) -> NDArray[np.float32]:
+        """(n, 3) light that goes through into all directions alike, as ``albedo``; 0 of rough glass."""
+        n = len(mesh.positions)
+        if self.rough_glass or not self.scatters_through:
+            return np.zeros((n, 3), np.float32)
+        value = self._directional_albedo(_covered(self.bsdf), self._looked_at(shape, mesh), -self._side)
+        return np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
+
+    def _looked_at(self, shape: mi.Mesh, mesh: TriangleMesh) -> mi.SurfaceInteraction3f:
+        """Its vertices, from the direction of their normals."""
         n = len(mesh.positions)
         corner_of = np.zeros(n, np.int64)  # [vertex] -> index into the flattened triangles
         flat = mesh.triangles.ravel()
@@ -234,24 +263,10 @@ class Material:
         si = shape.compute_surface_interaction(ray, pi)
         si.t = mi.Float(1.0)
         si.wi = mi.Vector3f(0, 0, self._side)
-        covered = _covered(self.bsdf)
-        if self.rough_glass:
-            value = mi.Color3f(0)
-        elif _lambertian(covered):
-            value = covered.eval_diffuse_reflectance(si)
-        else:
-            value = self._directional_albedo(covered, si)
-        albedo = np.array(dr.zeros(mi.Color3f, n) + value, dtype=np.float32).T.copy()
-        bad = np.flatnonzero(~((albedo >= 0) & (albedo <= 1 + 1e-5)).all(axis=1))
-        if bad.size:
-            raise PrtError(
-                f"shape '{self.name}': vertex {bad[0]} has the albedo {albedo[bad[0]].tolist()} "
-                f"({bad.size} such vertices): reflectance must lie in 0..1"
-            )
-        return np.ascontiguousarray(np.minimum(albedo, 1))
+        return si
 
-    def _directional_albedo(self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> mi.Color3f:
-        """The share of light from the normal's direction that is reflected, but for mirrors: a mean of samples."""
+    def _directional_albedo(self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, side: int) -> mi.Color3f:
+        """The share of light from the normal's direction that is sent to a side (1, -1), but for single directions."""
         context = mi.BSDFContext()
         total = dr.zeros(mi.Color3f, dr.width(si))
         n = 8  # strata per axis
@@ -262,7 +277,7 @@ class Material:
             u = mi.Point2f(x, y)
             sample, weight = bsdf.sample(context, si, lobe, u)
             single = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            total += dr.select((sample.wo.z * self._side > 0) & ~single, mi.Color3f(weight), 0)
+            total += dr.select((sample.wo.z * side > 0) & ~single, mi.Color3f(weight), 0)
             dr.eval(total)
         return dr.clip(total / (n * n), 0, 1)
 

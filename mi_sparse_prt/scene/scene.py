@@ -84,6 +84,9 @@ class Scene:
     albedo : (n_v, 3) float32
         Diffuse reflectance (rgb, 0..1). For a BSDF that is not diffuse, its directional albedo at normal
         incidence.
+    transmitted : (n_v, 3) float32
+        Light that goes through into all directions on the other side, as curtains and leaves let it; measured as the
+        albedo, which it is no part of.
     meshes : tuple of Mesh
         The fronts of all shapes (those of instances last, one for each BSDF), then the backs of two-sided ones, as
         far as light can reach them.
@@ -144,15 +147,23 @@ class Scene:
         names = [meshes[run.start].name for run in self._runs]
         self.normalised = TracedScene(build_mitsuba_scene(unit, names))
 
-        albedo = [k.albedo(build_mitsuba_mesh(m, k.bsdf), m) for m, k in zip(meshes, materials, strict=True)]
+        shown = [(k, build_mitsuba_mesh(m, k.bsdf), m) for m, k in zip(meshes, materials, strict=True)]
+        albedo, through = ([of(*own) for own in shown] for of in (Material.albedo, Material.transmittance))
         lamps = self._normalise(places_of_lamps(mitsuba))
         backs, self.dark_backs = find_backs(self.normalised, meshes, materials, lamps)
         behind = {back.shape: materials[back.shape].back() for back in backs}
-        reflected = {
-            k: own.albedo(build_mitsuba_mesh(meshes[k], own.bsdf), meshes[k]) for k, own in behind.items()
+        shown_behind = {
+            k: (own, build_mitsuba_mesh(meshes[k], own.bsdf), meshes[k]) for k, own in behind.items()
         }
-        backs = [back for back in backs if reflected[back.shape].any()]
-        self.albedo = np.concatenate([*albedo, *(reflected[back.shape][back.vertices] for back in backs)])
+        reflected, passed = (
+            {k: of(*own) for k, own in shown_behind.items()}
+            for of in (Material.albedo, Material.transmittance)
+        )
+        backs = [back for back in backs if reflected[back.shape].any() or passed[back.shape].any()]
+        self.albedo, self.transmitted = (
+            np.concatenate([*front, *(back[k.shape][k.vertices] for k in backs)])
+            for front, back in ((albedo, reflected), (through, passed))
+        )
         self.materials = [*materials, *(behind[back.shape] for back in backs)]
         self.meshes = _listed(meshes, backs)
         self.fronts = self.meshes[: len(meshes)]
@@ -302,6 +313,11 @@ class Scene:
         if len(self.meshes) > FEW_MESHES:
             return [slice(0, self.n_vertices)]
         return [mesh.vertices for mesh in self.meshes]
+
+    @cached_property
+    def sent_albedo(self) -> NDArray[np.float32]:
+        """(n_v, 3) of all light that vertices receive, what they send on: to their own side and to the other."""
+        return np.minimum(self.albedo + self.transmitted, 1)
 
     @cached_property
     def vertex_areas(self) -> NDArray[np.float32]:

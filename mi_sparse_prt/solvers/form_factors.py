@@ -132,6 +132,9 @@ class Surfaces:
         self._positions = mi.Point3f(vertex_points(scene).positions.T)
         self._normalised_positions = scene.normalised_positions
         self._albedo = mi.Float(scene.albedo.mean(axis=1))
+        # rays that meet one side find, by chance, the light that comes through from the other
+        through = scene.transmitted.mean(axis=1) / np.maximum(scene.sent_albedo.mean(axis=1), 1e-6)
+        self._others = (mi.Float(through), _other_sides(scene)) if through.any() else None
         self._most = MOST_IN_GAP if max_depth < 0 else min(max(max_depth - 3, 0), MOST_IN_GAP)
         self._endless = max_depth < 0
         dr.eval(self._positions, self._albedo)
@@ -159,7 +162,7 @@ class Surfaces:
         """Rays, their points, the vertices that they meet, and whether in a narrow gap; where, and random numbers."""
         ray, point, u, rng = rays
         hit = self._scene.ray_intersect_preliminary(ray)
-        vertex = self.corner(hit, ray, u)
+        vertex = self.corner(hit, ray, u, rng)
         return ray, point, vertex, self._is_narrow(hit, ray, vertex), hit, rng
 
     def _is_narrow(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, vertex: mi.UInt32) -> mi.Mask:
@@ -198,7 +201,7 @@ class Surfaces:
             reflected = lit & (met < most)
             ray, hit = dr.select(reflected, onward, ray), dr.select(reflected, found, hit)
             absorbed = blocked & ~is_open & ~(lit if self._endless else reflected)
-            vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32()), vertex)
+            vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32(), rng), vertex)
             vertex = dr.select(absorbed, NOTHING, vertex)
             opened = inside & ~blocked & ~is_open
             goes_on = again | opened | (reflected & self._is_narrow(hit, ray, vertex))
@@ -232,10 +235,13 @@ class Surfaces:
         lifted = dr.fma(normal, ray_offset(start), start)
         return mi.Ray3f(lifted, direction)
 
-    def corner(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
+    def corner(
+        self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float, rng: mi.PCG32
+    ) -> mi.UInt32:
         """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING.
 
-        Also NOTHING with the probability of light to go straight on: rows of masks are those of what they cover.
+        Also NOTHING with the probability of light to go straight on: rows of masks are those of what they cover. And
+        the corner on the other sheet with the probability that what is sent to the ray has come through from there.
         """
         valid = hit.is_valid()
         if self._passes_straight:
@@ -243,7 +249,11 @@ class Surfaces:
             passed = dr.sum(mi.Color3f(si.bsdf().eval_null_transmission(si, valid))) / 3
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
-        return self.corner_met(hit, ray, u, valid)
+        vertex = self.corner_met(hit, ray, u, valid)
+        if self._others is None:
+            return vertex
+        through, other = (dr.gather(type(x), x, vertex, vertex != NOTHING) for x in self._others)
+        return dr.select((vertex != NOTHING) & (rng.next_float32() < through), other, vertex)
 
     def corner_met(
         self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float, valid: mi.Mask
@@ -296,6 +306,13 @@ class Surfaces:
         expected = dr.select(front, expected, dr.gather(mi.UInt32, self._backs, expected, ~front))
         own = hit.is_valid() & (self._scene.triangle(hit, hit.is_valid()) == triangle)
         return expected, self.corner_met(hit, ray, u, own)
+
+
+def _other_sides(scene: Scene) -> mi.UInt32:
+    """The vertex on the other side of each, or NOTHING."""
+    fronts = len(scene.backs)
+    others = np.concatenate([np.where(scene.backs < 0, NOTHING, scene.backs), scene.front_of[fronts:]])
+    return mi.UInt32(others.astype(np.uint32))
 
 
 def cosine_rays(

@@ -151,7 +151,7 @@ def glossy_indirect(
         Of the noise of unit-albedo rows.
     """
     assert isinstance(problem.sending, InOutFactors)
-    albedo, outgoing = _channels(problem.sending)
+    albedo, outgoing = _channels(problem)
     rays_per_vertex, tolerance, seed = effort
     first, noise = _form_factors(problem, direct, nodes, outgoing, effort)
     tolerance = max(tolerance, math.sqrt(BESIDE_NOISE) * min(noise.bounce, MOST_NOISE))
@@ -197,9 +197,12 @@ def _after_mirrors(
     return matrices
 
 
-def _channels(reflection: InOutFactors) -> tuple[Floats, Floats]:
+def _channels(problem: Problem) -> tuple[Floats, Floats]:
     """Albedos (channels, n_v) and g_k (channels, ...); one channel where all are alike."""
-    albedo, outgoing = reflection.albedo, outgoing_tables(reflection.factors)
+    reflection = problem.sending
+    assert isinstance(reflection, InOutFactors)
+    albedo = np.minimum(reflection.albedo + problem.scene.transmitted, 1)
+    outgoing = outgoing_tables(reflection.factors)
     grey = np.ptp(albedo, axis=1).max() <= EVEN and np.ptp(outgoing, axis=4).max() <= EVEN * outgoing.max()
     count = 1 if grey else 3
     return np.ascontiguousarray(albedo.T[:count]), np.ascontiguousarray(np.moveaxis(outgoing, 4, 0)[:count])

@@ -511,7 +511,7 @@ class RadiositySolver(FiniteElements):
         nodes = nodes or Nodes(np.arange(len(points)), None)
         super().__init__(
             [form_factors(problem, rays_per_vertex, seed, nodes.ids)],
-            np.ascontiguousarray(scene.albedo.T[: problem.channels]),
+            np.ascontiguousarray(scene.sent_albedo.T[: problem.channels]),
             points.keys,
             nodes,
             problem.max_depth,
