@@ -59,12 +59,14 @@ def test_among_glossy_surfaces():
         "type": "sphere",
         "center": [8, 0, 0],
         "radius": 0.3,
-        "bsdf": {"type": "roughconductor", "alpha": 0.4},
+        "bsdf": {"type": "roughplastic", "alpha": 0.3},
     }
     scene, sky = hall(1.2, False, ball=ball), prt.CubemapLighting(4)
     ids = np.arange(scene.meshes[0].vertices.stop)
     matrices = [
-        prt.precompute(scene, sky, "gather", basis="texel", max_depth=4, terms=terms, progress=False)
+        prt.precompute(
+            scene, sky, "gather", basis="texel", max_depth=4, terms=terms, target_error=0.1, progress=False
+        )
         for terms in (0, "auto")
     ]
     assert matrices[1].terms
