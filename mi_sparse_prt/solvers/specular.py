@@ -206,8 +206,15 @@ class SpecularSearch:
 
 
 def _direct_norm(problem: Problem, ids: Ids, power: Doubles, seed: int) -> float:
-    """Squared norm of the radiance of direct light, about: from some of the points."""
-    some = np.random.default_rng(seed).permutation(len(ids))[:SAMPLE]
+    """Squared norm of the radiance of direct light, about: from some of the points, drawn by what their light counts.
+
+    Where few of many points are bright, others say next to nothing.
+    """
+    chance = power.sum(axis=1)
+    if not chance.any():
+        return 0.0
+    chance /= chance.sum()
+    some = np.random.default_rng(seed).choice(len(ids), SAMPLE, p=chance)
     size = problem.emission.size
     place = np.repeat(ids[some], size), np.tile(np.arange(size), len(some))
     if isinstance(problem.emission, CubemapLighting):
@@ -215,4 +222,4 @@ def _direct_norm(problem: Problem, ids: Ids, power: Doubles, seed: int) -> float
     else:
         light = LampRays(problem, 4, seed).elements(*place).mean.astype(np.float64)
     squares = np.square(light).reshape(len(some), size, -1).sum(axis=1) * np.ones(3)
-    return float((squares * power[some]).sum()) * len(ids) / max(len(some), 1)
+    return float(((squares * power[some]).sum(axis=1) / chance[some]).mean())
