@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mi_sparse_prt.reconstruction.surface_smoothing import SurfaceSmoothing, noise_left
+from mi_sparse_prt.reconstruction.surface_smoothing import OWN, SurfaceSmoothing, noise_left
 from mi_sparse_prt.solvers.lamps import PILOT, LightByPaths
 from mi_sparse_prt.solvers.light_tracing import LightTracing
 from mi_sparse_prt.solvers.paths import Estimate
@@ -22,7 +22,6 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 SHARED = 1.5  # times as many paths are traced as elements have at least (``shared_out``)
 SPLITS = (0.0, 0.5, 1.0)  # of what is traced, what may be photons
 LEAST = 1e-30  # variance, where there is no light
-OWN = 0.25  # of its own variance a node has at least: the mean of neighbours would not know that it is an outlier
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -127,22 +126,20 @@ class LampLight:
         """
         if not self._known:
             return None
-        both = self._combined(self._first, self._weights(np.full(self._shape[1], self._seen[0]), 0.5))
+        both = self._combined(self._first, self._weights(np.full(self._shape[1], 0.5)))
         light, variance = (x.reshape(self._shape) for x in (both.mean, both.variance))
         left = noise_left(light, variance, self._levels).sum(axis=2)
         left = left / np.maximum(variance.sum(axis=2), LEAST)
-        whole = np.square(light.reshape(*self._shape[:2], -1, 3).sum(axis=2)).sum(axis=2) - variance.sum(
-            axis=2
-        )
+        by_colour = light.reshape(*self._shape[:2], -1, 3).sum(axis=2)
+        whole = np.square(by_colour).sum(axis=2) - variance.sum(axis=2)
         least, few = np.full(self._shape[1], self._spp), self._seen[0]
         for lamp in range(len(least)):
             enough = target**2 * float(self._power @ whole[:, lamp])
-            first = self._variance(lamp, few, self._first_split(lamp))
-            tried = [
-                (0, first),
-                *((k, self._variance(lamp, SHARED * k, self._split[lamp])) for k in (few // 2, few, 2 * few)),
-            ]
-            met = [k for k, noise in tried if 0 < self._power @ (noise * left[:, lamp]) <= enough]
+            noise = {0: self._variance(lamp, few, self._first_split(lamp))}
+            noise |= {
+                k: self._variance(lamp, SHARED * k, self._split[lamp]) for k in (few // 2, few, 2 * few)
+            }
+            met = [k for k, own in noise.items() if 0 < self._power @ (own * left[:, lamp]) <= enough]
             least[lamp] = min(met, default=self._spp)
         return least
 
@@ -150,9 +147,8 @@ class LampLight:
         """Whether the first paths or the first photons have less noise."""
         return min((0.0, 1.0), key=lambda split: float(self._power @ self._variance(lamp, 1, split)))
 
-    def _weights(self, effort: NDArray[np.int64], split: NDArray[np.float64] | float) -> Floats:
-        """What photons count (n, m), if each lamp has so many paths of each element or as many photons."""
-        split = np.broadcast_to(split, len(effort))
+    def _weights(self, split: Doubles) -> Floats:
+        """What photons count (n, m), if so much (m,) of all that is traced for a lamp are photons."""
         paths, photons = self._each
         others, known = (1 - split) / paths, split * len(paths) / photons
         alone = known == 0  # where no photons arrive, paths count even if all that is traced are photons
@@ -180,10 +176,9 @@ class LampLight:
             return self._paths.estimate(np.tile(effort, self._shape[0]), ticks)
         n, m, k = self._shape
         split = np.where(effort > 0, self._split, [self._first_split(lamp) for lamp in range(m)])
-        weights = self._weights(effort, split)
-        counts = np.where(weights < 1, np.rint(effort * np.where(weights > 0, 1 - split, 1)), 0).astype(
-            np.int64
-        )
+        weights = self._weights(split)
+        of_paths = np.where(weights > 0, 1 - split, 1)
+        counts = np.where(weights < 1, np.rint(effort * of_paths), 0).astype(np.int64)
         paths = self._paths.estimate(counts.ravel(), ticks)
         mean, variance = (x.reshape(n, m, k).copy() for x in vars(self._first[1]).values())
         for lamp in np.flatnonzero((effort > 0) & (split > 0)):

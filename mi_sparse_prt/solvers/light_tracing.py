@@ -36,6 +36,7 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 LANES = 1 << 21  # photons per wavefront
 PHOTONS = 13  # spawn key
 TRIED = 16  # places on each side of a triangle, at which it is looked whether photons arrive there
+SURVIVAL = 0.95  # at most, where ``max_depth`` sets no limit, as Mitsuba's ``path`` has it
 OPEN = 0.05  # of the area around a node, at least, on which photons arrive
 ALIKE = 1e-3  # normals
 
@@ -276,7 +277,8 @@ class LightTracing:
         )
         onwards = si.to_world(sample.wo)
         weight = sample_weight(sample, weight) * _of_shading_normals(si, sample.wo, onwards)
-        survival = dr.minimum(dr.max(weight), 1)
+        # without a limit, light between white surfaces would not end
+        survival = dr.minimum(dr.max(weight), 1 if self._problem.max_depth >= 0 else SURVIVAL)
         alive = valid & (survival > 0) & (rng.next_float32() < survival)
         power = dr.select(alive, photons.power * weight / survival, 0)
         straight = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
