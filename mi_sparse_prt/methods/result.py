@@ -26,7 +26,7 @@ class MethodResult:
     elements : dict
         ``direct`` and ``indirect``: how many elements of each part were evaluated.
     rays : dict
-        ``direct``: shadow rays; ``indirect_paths``.
+        ``direct``: shadow rays; ``indirect_paths``; of lamps ``photons``; ...
     specular : SpecularLight or None
         Light by way of mirrors and glass alone, where that is an operator of its own.
     skipped : list of str

@@ -147,22 +147,20 @@ class Scene:
         names = [meshes[run.start].name for run in self._runs]
         self.normalised = TracedScene(build_mitsuba_scene(unit, names))
 
-        shown = [(k, build_mitsuba_mesh(m, k.bsdf), m) for m, k in zip(meshes, materials, strict=True)]
-        albedo, through = ([of(*own) for own in shown] for of in (Material.albedo, Material.transmittance))
+        scattered = [_scattered(k, m) for m, k in zip(meshes, materials, strict=True)]
         lamps = self._normalise(places_of_lamps(mitsuba))
         backs, self.dark_backs = find_backs(self.normalised, meshes, materials, lamps)
         behind = {back.shape: materials[back.shape].back() for back in backs}
-        shown_behind = {
-            k: (own, build_mitsuba_mesh(meshes[k], own.bsdf), meshes[k]) for k, own in behind.items()
-        }
-        reflected, passed = (
-            {k: of(*own) for k, own in shown_behind.items()}
-            for of in (Material.albedo, Material.transmittance)
-        )
-        backs = [back for back in backs if reflected[back.shape].any() or passed[back.shape].any()]
+        scattered_behind = {k: _scattered(own, meshes[k]) for k, own in behind.items()}
+        backs = [back for back in backs if any(part.any() for part in scattered_behind[back.shape])]
         self.albedo, self.transmitted = (
-            np.concatenate([*front, *(back[k.shape][k.vertices] for k in backs)])
-            for front, back in ((albedo, reflected), (through, passed))
+            np.concatenate(
+                [
+                    *(own[part] for own in scattered),
+                    *(scattered_behind[k.shape][part][k.vertices] for k in backs),
+                ]
+            )
+            for part in (0, 1)
         )
         self.materials = [*materials, *(behind[back.shape] for back in backs)]
         self.meshes = _listed(meshes, backs)
@@ -454,6 +452,12 @@ class Scene:
     def __repr__(self) -> str:
         names = ", ".join(f"{m.name} {m.vertices.stop - m.vertices.start}" for m in self.meshes)
         return f"Scene({self.n_vertices} vertices: {names})"
+
+
+def _scattered(material: Material, mesh: TriangleMesh) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Albedo and transmittance (n, 3) each, of a shape that does not stay alive: kernels would be slower."""
+    shape = build_mitsuba_mesh(mesh, material.bsdf)
+    return material.albedo(shape, mesh), material.transmittance(shape, mesh)
 
 
 def _alike(materials: Sequence[Material]) -> list[slice]:

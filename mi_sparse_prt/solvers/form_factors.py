@@ -162,8 +162,9 @@ class Surfaces:
         """Rays, their points, the vertices that they meet, and whether in a narrow gap; where, and random numbers."""
         ray, point, u, rng = rays
         hit = self._scene.ray_intersect_preliminary(ray)
-        vertex = self.corner(hit, ray, u, rng)
-        return ray, point, vertex, self._is_narrow(hit, ray, vertex), hit, rng
+        vertex = self.corner(hit, ray, u)
+        sender = self.sender(vertex, rng)
+        return ray, point, sender, self._is_narrow(hit, ray, vertex) & (sender == vertex), hit, rng
 
     def _is_narrow(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, vertex: mi.UInt32) -> mi.Mask:
         return (vertex != NOTHING) & (hit.t < NARROW * self._way(hit, ray, vertex))
@@ -201,7 +202,7 @@ class Surfaces:
             reflected = lit & (met < most)
             ray, hit = dr.select(reflected, onward, ray), dr.select(reflected, found, hit)
             absorbed = blocked & ~is_open & ~(lit if self._endless else reflected)
-            vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32(), rng), vertex)
+            vertex = dr.select(again | reflected, self.corner(hit, ray, rng.next_float32()), vertex)
             vertex = dr.select(absorbed, NOTHING, vertex)
             opened = inside & ~blocked & ~is_open
             goes_on = again | opened | (reflected & self._is_narrow(hit, ray, vertex))
@@ -235,13 +236,10 @@ class Surfaces:
         lifted = dr.fma(normal, ray_offset(start), start)
         return mi.Ray3f(lifted, direction)
 
-    def corner(
-        self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float, rng: mi.PCG32
-    ) -> mi.UInt32:
+    def corner(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float) -> mi.UInt32:
         """The corner of each hit triangle that u in [0, 1) selects, on the sheet that is met; or NOTHING.
 
-        Also NOTHING with the probability of light to go straight on: rows of masks are those of what they cover. And
-        the corner on the other sheet with the probability that what is sent to the ray has come through from there.
+        Also NOTHING with the probability of light to go straight on: rows of masks are those of what they cover.
         """
         valid = hit.is_valid()
         if self._passes_straight:
@@ -249,11 +247,19 @@ class Surfaces:
             passed = dr.sum(mi.Color3f(si.bsdf().eval_null_transmission(si, valid))) / 3
             valid &= u >= passed
             u = (u - passed) / dr.maximum(1 - passed, 1e-6)
-        vertex = self.corner_met(hit, ray, u, valid)
+        return self.corner_met(hit, ray, u, valid)
+
+    def sender(self, vertex: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
+        """The vertex whose light each sends on to what sees it: by chance the one on the other side, or NOTHING.
+
+        With the probability that what is sent has come through the surface (``Scene.transmitted``); of what vertices
+        receive, they send on ``Scene.sent_albedo``.
+        """
         if self._others is None:
             return vertex
-        through, other = (dr.gather(type(x), x, vertex, vertex != NOTHING) for x in self._others)
-        return dr.select((vertex != NOTHING) & (rng.next_float32() < through), other, vertex)
+        known = vertex != NOTHING
+        through, other = (dr.gather(type(x), x, vertex, known) for x in self._others)
+        return dr.select(known & (rng.next_float32() < through), other, vertex)
 
     def corner_met(
         self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, u: mi.Float, valid: mi.Mask

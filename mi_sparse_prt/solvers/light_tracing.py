@@ -242,9 +242,8 @@ class LightTracing:
         origin = self._scene.from_world(ray.o)
         # off the lamp's own surface
         ray = mi.Ray3f(dr.fma(ray.d, ray_offset(origin), origin), ray.d)
-        dr.eval(
-            ray, power, rng
-        )  # a kernel on a GPU traces rays in one scene only: lamps with textures look for places
+        # a kernel on a GPU traces rays in one scene only, and lamps with textures may look for places by rays
+        dr.eval(ray, power, rng)
         return _Photons(ray, power / dr.opaque(mi.Float, every), rng, dr.zeros(mi.Mask, count))
 
     def _arrived(
@@ -291,7 +290,7 @@ def _of_shading_normals(si: mi.SurfaceInteraction3f, local: mi.Vector3f, onwards
 
     0 where shading normals would let light leak, as in Mitsuba's ``ptracer``.
     """
-    came, goes = -dr.dot(si.n, si.to_world(-si.wi)), dr.dot(si.n, onwards)
+    came, goes = dr.dot(si.n, si.to_world(si.wi)), dr.dot(si.n, onwards)
     cosine_in, cosine_out = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(local)
     valid = (came * cosine_in > 0) & (goes * cosine_out > 0)
     return dr.select(valid, dr.abs(cosine_in * goes / (cosine_out * came)), 0)

@@ -411,7 +411,8 @@ class SpecularChains:
             if to_light:
                 column, radiance = self._light_met(hit, ray, goes_on & ~straight)
             else:
-                column = dr.select(valid, self._surfaces.corner(hit, ray, rng.next_float32(), rng), NOTHING)
+                corner = self._surfaces.corner(hit, ray, rng.next_float32())
+                column = dr.select(valid, self._surfaces.sender(corner, rng), NOTHING)
             brought = weight * radiance
             ends = goes_on & (column != NOTHING) & (dr.max(brought) > 0)
             alive = goes_on & valid & (dr.max(weight) > 0)
