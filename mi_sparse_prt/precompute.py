@@ -76,7 +76,8 @@ def precompute(
     scene : Scene
     lighting : CubemapLighting, SceneEmitters, or another ``emission.space.SampledEmission``
         The emission space: one column per texel, or per lamp. Of lamps, ``method`` is ``"gather"`` (diffuse scenes, the
-        default there) or ``"brute_force"`` (64 paths per element, or ``spp``, or as many photons; more where they spread).
+        default there) or ``"brute_force"`` (64 paths per element or as many photons, or ``spp``; more where
+        they spread).
     method : {"auto", "brute_force", "sparse", "huang2010", "gather"} or Plan
         What is evaluated, and how. ``"auto"`` measures on a few hundred vertices what rays, paths and gathering cost
         in this scene on this machine, predicts time and error of all plans, and takes the quickest that meets the

@@ -1,7 +1,7 @@
 """Indirect light of lamps at nodes, from paths that start there and photons that arrive: each counts by its noise.
 
-Photons are noisy next to lamps and in the open, paths where light comes from small bright places. Few of both, which are
-no part of the result, tell how noisy they are at each node, and which lamps need what.
+Photons are noisy next to lamps and in the open, paths where light comes from small bright places. Few of both, which
+are no part of the result, tell how noisy they are at each node, and which lamps need what.
 """
 
 from __future__ import annotations
