@@ -18,7 +18,7 @@ from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.sampling.angular import AngularGrid
 from mi_sparse_prt.sampling.consensus import Consensus, Surface, sample_by_levels
 from mi_sparse_prt.scene.scene import Scene
-from mi_sparse_prt.solvers.adaptive_strata import ACROSS, FIRST, Strata, adaptive_visibility
+from mi_sparse_prt.solvers.adaptive_strata import ACROSS, FIRST, Strata, adaptive_visibility, importance_of
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.texel_edges import fractional_visibility
@@ -92,15 +92,18 @@ def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: i
     as ``across**2``. Two numbers of strata tell both.
     """
     few, costs, each = _few(direct, held), list[DirectCost](), 0.0
+    importance = importance_of(direct.problem)[held.vertices]
     for first in FIRST:
-        some, each = _strata_costs(few, held, first, seed)
+        some, each = _strata_costs(few, importance, held, first, seed)
         costs += some
     good = max(aim, min(cost.error for cost in costs) / MINIMUM_GAIN)
     best = min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
     return replace(best, seconds=best.seconds * each)
 
 
-def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> tuple[list[DirectCost], float]:
+def _strata_costs(
+    few: Problem, importance: NDArray[np.float32], held: PilotElements, first: int, seed: int
+) -> tuple[list[DirectCost], float]:
     """Of all that a pilot's points stand for, with rays in place of seconds; and seconds of a ray.
 
     The last rays say what one takes: they are most, and no kernel is compiled for them.
@@ -108,7 +111,7 @@ def _strata_costs(few: Problem, held: PilotElements, first: int, seed: int) -> t
     rays, squares, each, costs = [], [], 0.0, []
     for across in (ACROSS[0], ACROSS[-1]):
         start = time.perf_counter()
-        part, traced = adaptive_visibility(few, Strata(first, across), seed)
+        part, traced = adaptive_visibility(few, Strata(first, across), seed, importance)
         each = (time.perf_counter() - start) / max(int(traced.sum()), 1)
         rays.append(float(held.stand_for @ traced))
         squares.append(held.squared_error_of_shares(part))

@@ -63,6 +63,16 @@ class InOutFactors(Reflection):
         lobes = np.sqrt(tables[self.material[self.glossy]])
         return np.concatenate([self.albedo, lobes.reshape(-1, 3)])
 
+    @property
+    def importance(self) -> Floats:
+        squares = np.square(self.albedo).mean(axis=1)
+        for number, factors in enumerate(self.factors):
+            # a white diffuse one takes up cos / pi, whose squared norm is 2 / (3 pi)
+            incident = np.square(factors.incident) @ factors.grid.solid_angles * (1.5 * np.pi)
+            lobes = self._view_means(factors, 2).mean(axis=1)[: factors.terms]
+            squares[self.material == number] += incident @ lobes
+        return np.sqrt(squares).astype(np.float32)
+
     def squares(self, points: slice) -> tuple[NDArray[np.int64], Floats]:
         rows, squares = np.arange(points.start, points.stop)[:, None], np.square(self.albedo[points])[:, None]
         number = int(self.material[points.start])

@@ -45,6 +45,11 @@ class Reflection(ABC):
     @abstractmethod
     def mean_lobes(self) -> Floats: ...
 
+    @property
+    @abstractmethod
+    def importance(self) -> Floats:
+        """What points (n,) make of light from one direction: root mean square, 1 if diffuse and white."""
+
     @abstractmethod
     def squares(self, points: slice) -> tuple[NDArray[np.int64], Floats]:
         """How much rows count in the squared error of radiance.
@@ -179,6 +184,10 @@ class Diffuse(Reflection):
     @property
     def mean_lobes(self) -> Floats:
         return np.zeros((0, 0, 3), np.float32)
+
+    @property
+    def importance(self) -> Floats:
+        return np.sqrt(np.square(self.albedo).mean(axis=1))
 
     def squares(self, points: slice) -> tuple[NDArray[np.int64], Floats]:
         return np.arange(points.start, points.stop)[:, None], np.square(self.albedo[points])[:, None]

@@ -3,12 +3,12 @@
 ``texel_edges`` needs fewer rays where one edge cuts a texel. Slats, twigs and leaves that are narrower than a texel
 cut it more than once; there the error of strata falls as their number to the power -3/4, whatever is in the texel.
 So the rays of a texel that leave the smallest squared error in all are as c^(4/5) v^(2/5): c is its weight, the cosine
-times the solid angle, and v the chance that it is seen in part at all.
+times the solid angle and what the point makes of light, and v the chance that it is seen in part at all.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numba
 import numpy as np
@@ -35,6 +35,7 @@ ADAPTIVE = 14  # spawn key
 MISSED = 0.005  # of the light of a point, which may be where no ray has found any
 
 Shares = NDArray[np.int16]
+Floats: TypeAlias = NDArray[np.float32]
 
 
 class Strata(NamedTuple):
@@ -46,17 +47,24 @@ class Strata(NamedTuple):
         Of all texels. One is enough where what is seen in part is seldom narrower than texels.
     across : float
         Of those that are seen in part, or of which one beside is not seen alike, if their weight is the mean of those
-        above the horizon, and two of those beside are not seen alike; of others as their rays are worth. Of points
-        whose light comes through what is far finer than texels, all texels have so many: what no ray has found is as
-        much as what one ray alone has found (Good 1953).
+        above the horizon, two of those beside are not seen alike, and most light arrives at points that make as much
+        of it; of others as their rays are worth. Of points whose light comes through what is far finer than texels, all
+        texels have so many: what no ray has found is as much as what one ray alone has found (Good 1953).
     """
 
     first: int = 2
     across: float = 4
 
 
+def importance_of(problem: Problem) -> Floats:
+    """How much light counts at points (n,), 1 where most of it counts: what they make of it, or their mesh does."""
+    own = problem.over_meshes(problem.reflection.importance)
+    whole = np.square(own, dtype=np.float64)
+    return (own * (whole.sum() / max(float((whole * own).sum()), 1e-30))).astype(np.float32)
+
+
 def adaptive_visibility(
-    problem: Problem, strata: Strata, seed: int
+    problem: Problem, strata: Strata, seed: int, importance: Floats | None = None
 ) -> tuple[FractionalVisibility, NDArray[np.int64]]:
     """Visible shares of all texels, from strata of these.
 
@@ -66,6 +74,8 @@ def adaptive_visibility(
         In the texel basis.
     strata : Strata
     seed : int
+    importance : (n,) float32, optional
+        ``importance_of`` the points, if not that of all of the problem's.
 
     Returns
     -------
@@ -84,12 +94,13 @@ def adaptive_visibility(
     )
     near = np.ascontiguousarray(np.hstack([lighting.sides.tables.beside, lighting.sides.tables.across]))
     weights = lighting.directions * (2 * lighting.solid_angles / lighting.solid_angles.mean())[:, None]
+    counts_as = importance_of(problem) if importance is None else importance
     blocks, rays = [], np.zeros(len(points), np.int64)
     for a in range(0, max(len(points), 1), step):
         ids = np.arange(a, min(a + step, len(points)), dtype=np.uint32)
         shares = first.rows_of_shares(ids)
         again = np.zeros(shares.shape, np.uint8)
-        worth = points.normals[ids], weights.astype(np.float32)
+        worth = points.normals[ids] * counts_as[ids, None], weights.astype(np.float32), counts_as[ids]
         run_in_parts(_ask_again, len(ids), *strata, shares, near, *worth, again)
         rays[ids] = strata.first**2 * (shares >= 0).sum(axis=1) + np.square(again, dtype=np.int64).sum(axis=1)
         row, texel = (places.astype(np.uint32) for places in np.nonzero(again))
@@ -121,15 +132,19 @@ def _ask_again(
     across: float,
     shares: Shares,
     near: NDArray[np.int32],
-    normals: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    normals: Floats,
+    weights: Floats,
+    importance: Floats,
     again: NDArray[np.uint8],
 ) -> None:
     """Strata per axis of texels above the horizon that are not seen as all those around them, by what rays are worth.
 
     All, where light is too fine; others have none. ``weights`` are vectors, whose products with a normal are weights.
+    Points of which no more rays are worth it have none.
     """
     for i in range(first, last):
+        if across * importance[i] ** 0.4 < few + 0.5:
+            continue
         total, single = 0.0, 0
         for t in range(shares.shape[1]):
             own = least = most = shares[i, t]

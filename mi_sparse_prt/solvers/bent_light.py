@@ -33,19 +33,34 @@ Floats = NDArray[np.float32]
 
 
 class BentLight:
-    """Light that arrives around corners: by mirrors and glass."""
+    """Light that arrives around corners, by mirrors and glass, at points that make anything of it.
+
+    Parameters
+    ----------
+    problem : Problem
+    ids : (n,) integers
+        Points.
+    power : (n, 3) float64
+        What squared errors of their light count.
+    seeds : list of int
+    """
 
     def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
         self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
         self._size = problem.emission.size * max(problem.depths_apart, 1)
         self._keys = problem.points.keys[np.asarray(ids)]
-        self._cells = self._chains.find_cells(ids, next(self._seeds))
-        self._moments = _Moments(self._cells, power.max(axis=1))
+        albedo = problem.over_meshes(problem.reflection.albedo.max(axis=1))[ids].astype(np.float64)
+        lit = np.flatnonzero(albedo)
+        cells = self._chains.find_cells(ids[lit], next(self._seeds))
+        self._cells = cells._replace(rows=lit[cells.rows])
+        self._moments = _Moments(self._cells, albedo**2)
+        #: What light counts in each cell: roots of squares, beside the most.
+        self._worth = (albedo / max(albedo.max(initial=0), 1e-30))[self._cells.rows]
 
     def estimated(self, first: float, last: float, averaging: Averaging | None = None) -> RefinedMean:
         """As many rays as the noise asks for; those before say where light comes from.
 
-        First, rays are in proportion to the share of light that surfaces send on.
+        First, rays are in proportion to the share of light that surfaces send on, and to what points make of it.
 
         Parameters
         ----------
@@ -57,7 +72,7 @@ class BentLight:
         if first >= last:
             only = self._sampled(np.full(len(self._cells.rows), float(first**2)), most)
             return RefinedMean(only._replace(rays=found + only.rays), None, self._power, averaging)
-        shares = np.clip(self._cells.shares.astype(np.float64), LEAST_SHARE, 1)
+        shares = np.clip(self._cells.shares * self._worth, LEAST_SHARE, 1)
         each = np.clip(FEWEST / max(len(shares), 1), first**2, max(first, 1) ** 2)
         begun = self._sampled(each * shares, most)
 
@@ -127,8 +142,7 @@ class _Moments:
     def __init__(self, cells: Cells, power: Doubles) -> None:
         starts = np.flatnonzero(np.diff(cells.rows, prepend=-1))
         self._numbers, self._starts = cells.numbers, np.append(starts, len(cells.rows))
-        least = LEAST_SHARE * power.max(initial=0)  # black vertices have rays, too
-        self._power = np.maximum(power, least)[cells.rows]
+        self._power = power[cells.rows]
         self._squares, self._traced = np.zeros(len(cells.rows)), np.zeros(len(cells.rows))
         self._noise, self._rays = 0.0, np.ones(len(cells.rows))  # of the last estimate
         self._known: Doubles | None = None

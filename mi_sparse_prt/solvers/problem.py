@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.measurement.vertices import Points
@@ -69,6 +70,18 @@ class Problem:
     def channels(self) -> int:
         """1 in a grey scene, else 3."""
         return 1 if self.scene.grey else 3
+
+    def over_meshes(self, importance: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What counts at points (n,); at vertices no less than on average over their mesh (root mean square).
+
+        They are few beside the texels of a texture: pictures have others between them.
+        """
+        least = importance.copy()
+        if self.measurement.kind == "vertices":
+            for mesh in self.scene.meshes:
+                part = least[mesh.vertices.start : mesh.vertices.stop]
+                np.maximum(part, np.sqrt(np.square(part, dtype=np.float64).mean()), out=part)
+        return least
 
     def at(self, points: Points) -> Problem:
         """The same at other points of the scene (normalised frame), which receive light and reflect all of it."""
