@@ -29,7 +29,7 @@ from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.sizing_field import Details
 from mi_sparse_prt.scene.surfaces import read_surfaces
 from mi_sparse_prt.scene.traced_scene import TracedScene
-from mi_sparse_prt.scene.traversal import places_of_lamps
+from mi_sparse_prt.scene.traversal import places_of_cameras, places_of_lamps
 from mi_sparse_prt.scene.triangle_mesh import (
     TriangleMesh,
     concatenated,
@@ -148,8 +148,8 @@ class Scene:
         self.normalised = TracedScene(build_mitsuba_scene(unit, names))
 
         scattered = [_scattered(k, m) for m, k in zip(meshes, materials, strict=True)]
-        lamps = self._normalise(places_of_lamps(mitsuba))
-        backs, self.dark_backs = find_backs(self.normalised, meshes, materials, lamps)
+        places = (self._normalise(find(mitsuba)) for find in (places_of_lamps, places_of_cameras))
+        backs, self.dark_backs = find_backs(self.normalised, meshes, materials, *places)
         behind = {back.shape: materials[back.shape].back() for back in backs}
         scattered_behind = {k: _scattered(own, meshes[k]) for k, own in behind.items()}
         backs = [back for back in backs if any(part.any() for part in scattered_behind[back.shape])]

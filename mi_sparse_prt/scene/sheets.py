@@ -1,7 +1,8 @@
 """Two-sided surfaces: which of their backs light can reach; these have vertices of their own.
 
 A surface that reflects on both sides has two sheets. The backs of most are the insides of closed solids, where it is
-dark: no ray leaves them for anything but other dark backs. Such sheets have no rows.
+dark. They see fronts as well: solids stand in and on each other, and a floor goes on below a sofa. But no way from
+surface to surface leads from there to light. Such sheets have no rows.
 """
 
 from __future__ import annotations
@@ -12,9 +13,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.random_keys import hash_rows, random_generator
@@ -23,14 +22,17 @@ from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, find_pieces
 
-FEW_RAYS, MANY_RAYS = (
+FEW_WAYS, MANY_WAYS = (
     64,
     4096,
 )  # from each piece of a surface: most find light at once, the others look closely
+LEAKS = 1e-4  # of the ways from a piece, which slip through where surfaces meet
+LONGEST = 8  # surfaces on a way, those that light goes through apart
 LANES = 1 << 22  # rays per wavefront
 INSIDE = 0.85  # rays start this far inside of triangles: at their borders they leak through other surfaces
 
-NO_PIECE, PASSES_LIGHT = -1, -2  # what a triangle's back is, if no piece of a sheet
+NO_PIECE = -1  # of a triangle whose back is no sheet
+SCATTERS, PASSES, SHINES = 0, 1, 2  # what triangles do with a way
 
 Ids = NDArray[np.int64]
 
@@ -59,11 +61,12 @@ def find_backs(
     meshes: Sequence[TriangleMesh],
     materials: Sequence[Material],
     lamps: NDArray[np.float32] | None = None,
+    cameras: NDArray[np.float32] | None = None,
 ) -> tuple[list[Back], list[str]]:
     """The backs of two-sided surfaces that light can reach, and the names of shapes that have others as well.
 
-    Light reaches a connected piece of a surface if a ray from its back leaves the scene, or meets the front of a
-    surface, one that light passes through, or the back of another piece that light reaches; or if a lamp shines on it.
+    Light reaches a connected piece of a surface if a random way from its back, from surface to surface, leaves the
+    scene, or meets an area lamp or a place that another lamp shines on.
 
     Parameters
     ----------
@@ -73,19 +76,20 @@ def find_backs(
     materials : sequence of Material
     lamps : (n, 3) float32, optional
         Places of lamps that are no surfaces, normalised.
+    cameras : (n, 3) float32, optional
+        Places from which pieces are seen that are kept, however dark: a room may be so on purpose.
 
     Notes
     -----
-    A piece counts as dark if none of 4096 or more cosine-distributed rays, at least one from each of its triangles,
-    finds light: then less than a thousandth of what its points see is lit, with a probability of 98%.
+    A piece counts as dark if none of 4096 or more ways, at least one from each of its triangles, finds light, or one in
+    ten thousand: then less than a thousandth of what would reach it in the open does, with a probability of 98%.
     """
     if not any(material.two_sided for material in materials):
         return [], []
     pieces = _pieces(meshes, materials)
-    passing = np.repeat([m.passes_light for m in materials], [len(mesh.triangles) for mesh in meshes])
-    bright = _bright_pieces(
-        scene, meshes, pieces, passing, np.zeros((0, 3), np.float32) if lamps is None else lamps
-    )
+    none = np.zeros((0, 3), np.float32)
+    looks = _Looks(scene, meshes, materials, pieces, none if lamps is None else lamps)
+    bright = _bright_pieces(looks, pieces, none if cameras is None else cameras)
     found, dark, first = [], [], 0
     for shape, mesh in enumerate(meshes):
         own = pieces[first : first + len(mesh.triangles)]
@@ -110,12 +114,11 @@ def _back(shape: int, mesh: TriangleMesh, lit: NDArray[np.bool_]) -> Back:
 
 
 def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Ids:
-    """Number of the connected piece of each triangle's back; NO_PIECE where it is black, or PASSES_LIGHT."""
+    """Number of the connected piece of each triangle's back; NO_PIECE where that is black, or lets light through."""
     result, count = [], 0
     for mesh, material in zip(meshes, materials, strict=True):
-        n = len(mesh.triangles)
         if not material.two_sided:
-            result.append(np.full(n, PASSES_LIGHT if material.passes_light else NO_PIECE, np.int64))
+            result.append(np.full(len(mesh.triangles), NO_PIECE, np.int64))
             continue
         own = find_pieces(mesh)
         result.append(count + own.of)
@@ -123,39 +126,26 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
     return np.concatenate(result)
 
 
-def _bright_pieces(
-    scene: TracedScene,
-    meshes: Sequence[TriangleMesh],
-    pieces: Ids,
-    passing: NDArray[np.bool_],
-    lamps: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Which pieces light reaches, (pieces,) bool; ``passing`` (triangles,): light goes through."""
-    n = int(pieces.max()) + 1
-    sees_light, seen = np.zeros(n, np.bool_), [np.zeros((0, 2), np.int64)]
-    looks = _Looks(scene, meshes, pieces, passing)
-    for lamp in lamps:
-        sees_light[looks.from_place(lamp)] = True
-    size = np.bincount(pieces[pieces >= 0], minlength=n)
-    for pass_, rays in enumerate((FEW_RAYS, MANY_RAYS)):
+def _bright_pieces(looks: _Looks, pieces: Ids, cameras: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which pieces light reaches, or are seen, (pieces,) bool."""
+    bright = np.zeros(int(pieces.max()) + 1, np.bool_)
+    for place in cameras:
+        bright[looks.from_place(place)] = True
+    size = np.bincount(pieces[pieces >= 0], minlength=len(bright))
+    for pass_, ways in enumerate((FEW_WAYS, MANY_WAYS)):
         some = np.flatnonzero(pieces >= 0)
-        some = some[~sees_light[pieces[some]]]
-        each = -(-rays // size[pieces[some]])  # rays from each triangle
-        for a in range(0, len(some), LANES // rays):
-            part = slice(a, a + LANES // rays)
-            lit, pairs = looks.from_backs(some[part], each[part], pass_)
-            sees_light[lit] = True
-            seen.append(pairs)
-    pairs = np.unique(np.concatenate(seen), axis=0)
-    graph = scipy.sparse.coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(n, n))
-    groups, group = connected_components(graph, directed=False)  # light goes both ways
-    bright = np.zeros(groups, np.bool_)
-    bright[group[sees_light]] = True
-    return np.asarray(bright[group])
+        some = some[~bright[pieces[some]]]
+        each = -(-ways // size[pieces[some]])  # ways from each triangle
+        lit = np.zeros(len(bright), np.int64)
+        for a in range(0, len(some), LANES // ways):
+            part = slice(a, a + LANES // ways)
+            lit += looks.from_backs(some[part], each[part], pass_)
+        bright |= lit > LEAKS * -(-ways // size) * size
+    return bright
 
 
 class _Looks:
-    """Rays from the backs of triangles, and what they meet.
+    """Ways from the backs of triangles, and whether they find light.
 
     Parameters
     ----------
@@ -163,16 +153,28 @@ class _Looks:
         In the normalised frame.
     meshes : sequence of TriangleMesh
         In any frame; normals count.
+    materials : sequence of Material
+        Of each mesh.
     pieces : (triangles,) int64
         Of all meshes, see ``_pieces``.
-    passing : (triangles,) bool
-        Whether light goes through.
+    lamps : (n, 3) float32
     """
 
     def __init__(
-        self, scene: TracedScene, meshes: Sequence[TriangleMesh], pieces: Ids, passing: NDArray[np.bool_]
+        self,
+        scene: TracedScene,
+        meshes: Sequence[TriangleMesh],
+        materials: Sequence[Material],
+        pieces: Ids,
+        lamps: NDArray[np.float32],
     ) -> None:
-        self._scene, self._pieces, self._passing = scene, pieces, passing
+        self._scene, self._pieces, self._lamps = scene, pieces, len(lamps)
+        self._places = mi.Point3f(np.ascontiguousarray(lamps.T))
+        kinds = [SHINES if m.shines else PASSES if m.passes_light else SCATTERS for m in materials]
+        sizes = [len(mesh.triangles) for mesh in meshes]
+        self._kind = mi.UInt32(np.repeat(kinds, sizes).astype(np.uint32))
+        black = [not (m.two_sided or m.passes_light) for m in materials]
+        self._black = mi.Bool(np.repeat(black, sizes))  # their backs
         corners = np.concatenate(
             [
                 np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[
@@ -183,50 +185,62 @@ class _Looks:
         ).astype(np.float32)  # [triangle, corner, xyz]
         outwards = np.concatenate([_mean_normals(mesh) for mesh in meshes])
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
         normal *= np.where(np.einsum("td,td->t", normal, outwards) > 0, -1, 1)[:, None]
         self._corners = [mi.Point3f(np.ascontiguousarray(corners[:, k].T)) for k in range(3)]
         self._backwards = dr.normalize(mi.Vector3f(np.ascontiguousarray(normal.T)))
         self._keys = mi.UInt64(hash_rows(corners.sum(axis=1)))
 
-    def from_backs(self, triangles: Ids, each: Ids, seed: int) -> tuple[Ids, NDArray[np.int64]]:
-        """Look back from some triangles, with so many rays each.
-
-        Returns
-        -------
-        lit : (l,) int64
-            Pieces from which a ray found light.
-        pairs : (m, 2) int64
-            Pieces that saw each other's backs.
-        """
+    def from_backs(self, triangles: Ids, each: Ids, seed: int) -> Ids:
+        """How many ways from each piece (pieces,) find light, of some triangles with so many ways each."""
         start = np.repeat(triangles, each)
         sample = np.arange(len(start)) - np.repeat(np.cumsum(each) - each, each)
-        triangle = on_device(mi.UInt32, start.astype(np.uint32))
-        other, lit = self._met(self._rays(triangle, on_device(mi.UInt32, sample.astype(np.uint32)), seed))
-        own = self._pieces[start]
-        facing = other >= 0
-        return np.unique(own[lit]), np.unique(np.stack([own[facing], other[facing]], axis=1), axis=0)
+        triangle, number = (on_device(mi.UInt32, x.astype(np.uint32)) for x in (start, sample))
+        found = self._finds_light(*self._rays(triangle, number, seed)).numpy()
+        return np.bincount(self._pieces[start[found]], minlength=int(self._pieces.max()) + 1)
 
     def from_place(self, place: NDArray[np.float32]) -> Ids:
         """Pieces whose backs are seen from a point (3,), looking around."""
-        rng = mi.PCG32(size=MANY_RAYS)
+        rng = mi.PCG32(size=MANY_WAYS)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-        met, _ = self._met(mi.Ray3f(mi.Point3f(place), direction))
-        return np.unique(met[met >= 0])
-
-    def _met(self, ray: mi.Ray3f) -> tuple[Ids, NDArray[np.bool_]]:
-        """The piece whose back each ray meets (NO_PIECE of a black one), and whether light comes from there.
-
-        It comes from all that is no back, and from backs that it goes through.
-        """
+        ray = mi.Ray3f(mi.Point3f(place), direction)
         hit = self._scene.ray_intersect_preliminary(ray)
         met = hit.is_valid()
         index = dr.select(met, self._scene.triangle(hit, met), 0)
-        # of the triangles themselves: by shading normals, a curved wall seen along it may be a front
         behind = met & (dr.dot(dr.gather(mi.Vector3f, self._backwards, index), ray.d) < 0)
-        piece = np.where(behind.numpy(), self._pieces[index.numpy()], PASSES_LIGHT)
-        return piece, (piece == PASSES_LIGHT) | (piece >= 0) & self._passing[index.numpy()]
+        seen = np.unique(np.where(behind.numpy(), self._pieces[index.numpy()], NO_PIECE))
+        return seen[seen >= 0]
 
-    def _rays(self, triangle: mi.UInt32, sample: mi.UInt32, seed: int) -> mi.Ray3f:
+    @dr.syntax
+    def _finds_light(self, ray: mi.Ray3f, rng: mi.PCG32) -> mi.Mask:
+        """Whether ways lead to light that begin with these rays, and go on as from white diffuse surfaces."""
+        active, found, left = mi.Mask(True), mi.Mask(False), dr.opaque(mi.UInt32, LONGEST)
+        while active:
+            hit = self._scene.ray_intersect_preliminary(ray, active)
+            met = active & hit.is_valid()
+            index = self._scene.triangle(hit, met)
+            kind = dr.gather(mi.UInt32, self._kind, index, met)
+            back = dr.gather(mi.Vector3f, self._backwards, index, met)
+            behind = dr.dot(back, ray.d) < 0
+            found |= active & ~met | met & (kind == SHINES) & ~behind
+            passes, side = kind == PASSES, dr.select(behind, back, -back)  # where the ray came from
+            place = ray(hit.t)
+            # back along the ray, where nothing is in the way: along the normal may be another surface that meets it
+            step = ray_offset(place) / dr.maximum(dr.abs(dr.dot(side, ray.d)), 1e-6)
+            place += ray.d * dr.select(passes, step, -dr.minimum(step, 0.5 * hit.t))
+            if dr.hint(self._lamps > 0, mode="scalar"):
+                lamp = dr.minimum(mi.UInt32(rng.next_float32() * self._lamps), self._lamps - 1)
+                towards = dr.gather(mi.Point3f, self._places, lamp, met) - place
+                asked = met & ~passes & (dr.dot(side, towards) > 0)
+                found |= asked & ~self._scene.ray_test(_up_to(place, towards), asked)
+            local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+            ray = mi.Ray3f(place, dr.select(passes, ray.d, mi.Frame3f(side).to_world(local)))
+            left -= dr.select(passes, 0, 1)
+            active = met & ~found & (left > 0)
+            active &= passes | ~(behind & dr.gather(mi.Bool, self._black, index, met))
+        return found
+
+    def _rays(self, triangle: mi.UInt32, sample: mi.UInt32, seed: int) -> tuple[mi.Ray3f, mi.PCG32]:
         rng = random_generator(dr.gather(mi.UInt64, self._keys, triangle), sample, mi.UInt32(0), seed)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(rng.next_float32(), rng.next_float32()))
         weights = [(1 - INSIDE) / 3 + INSIDE * x for x in (1 - b.x - b.y, b.x, b.y)]
@@ -236,7 +250,13 @@ class _Looks:
         )
         n = dr.gather(mi.Vector3f, self._backwards, triangle)
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-        return mi.Ray3f(dr.fma(n, ray_offset(p), p), mi.Frame3f(n).to_world(local))
+        return mi.Ray3f(dr.fma(n, ray_offset(p), p), mi.Frame3f(n).to_world(local)), rng
+
+
+def _up_to(place: mi.Point3f, towards: mi.Vector3f) -> mi.Ray3f:
+    ray = mi.Ray3f(place, towards)
+    ray.maxt = mi.Float(1)
+    return ray
 
 
 def _mean_normals(mesh: TriangleMesh) -> NDArray[np.float32]:

@@ -20,6 +20,13 @@ def places_of_lamps(scene: mi.Scene) -> NDArray[np.float32]:
     return np.concatenate(places).astype(np.float32)
 
 
+def places_of_cameras(scene: mi.Scene) -> NDArray[np.float32]:
+    """From where sensors look (n, 3), world."""
+    every = [mi.traverse(sensor) for sensor in scene.sensors()]
+    places = [np.ravel(at["to_world"].translation())[None] for at in every if "to_world" in at]
+    return np.concatenate([np.zeros((0, 3)), *places]).astype(np.float32)
+
+
 def children(thing: mi.Object) -> list[tuple[str, Any]]:
     """Names and values of the objects and parameters that a Mitsuba object holds itself; names may come twice."""
     callback = _Children()

@@ -92,8 +92,11 @@ def test_names_are_unique():
         ({"cube": {"type": "cube", "flip_normals": True, "bsdf": twosided(RED)}}, ["cube", "cube_back"]),
         (walls(6, twosided(RED)), [f"wall_{k}" for k in range(6)]),
         (walls(5, twosided(RED)), [*(f"wall_{k}" for k in range(5)), *(f"wall_{k}_back" for k in range(5))]),
-        # what lights the inside of a box: something in it that has a front, or that light passes through
+        # what lights the inside of a box: no front in it, but an area lamp, or a wall that light passes through
         (walls(6, twosided(RED)) | {"ball": {"type": "sphere", "radius": 0.1, "center": [0, 1, 0], "bsdf": RED}},
+         [*(f"wall_{k}" for k in range(6)), "ball"]),
+        (walls(6, twosided(RED)) | {"ball": {"type": "sphere", "radius": 0.1, "center": [0, 1, 0], "bsdf": RED,
+                                             "emitter": {"type": "area", "radiance": 1.0}}},
          [*(f"wall_{k}" for k in range(6)), "ball", *(f"wall_{k}_back" for k in range(6))]),
         (walls(5, twosided(RED)) | {"wall_5": walls(6, {"type": "thindielectric"})["wall_5"]},
          [*(f"wall_{k}" for k in range(6)), *(f"wall_{k}_back" for k in range(5))]),
@@ -142,6 +145,41 @@ def test_a_lamp_lights_a_closed_room(lamp):
     assert inside == ([f"wall_{k}_back" for k in range(6)] if lamp else [])
     assert len(scene.dark_backs) == (0 if lamp else 6)
     assert scene.hash != build(0.5, **walls(6, twosided(RED)), lamp=lamps[None]).hash or lamp is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_insides_of_solids_that_stand_in_each_other_are_dark(seed):
+    """Boxes and balls, turned at random, through each other and a floor, whose fronts they see from inside."""
+    rng, solids = np.random.default_rng(seed), {}
+    for k in range(12):
+        axis = rng.normal(size=3)
+        pose = T().translate((1.5 * rng.normal(size=3)).tolist())
+        pose = pose.rotate((axis / np.linalg.norm(axis)).tolist(), float(rng.uniform(0, 360)))
+        solid = {"type": ("cube", "sphere")[k % 2], "to_world": pose.scale(float(rng.uniform(0.2, 1)))}
+        solids[f"solid_{k}"] = solid | {"bsdf": twosided(RED)}
+    scene = build(floor={**GROUND, "bsdf": twosided(RED)}, **solids)
+    assert sorted(scene.dark_backs) == sorted(solids)
+    assert [mesh.name for mesh in scene.meshes[len(scene.fronts) :]] == ["floor_back"]
+
+
+@pytest.mark.parametrize("lamp", [True, False])
+def test_walls_that_a_lamp_lights_around_corners(lamp):
+    """A plate before one wall of a closed box, which a lamp in the middle does not see past: others light that wall."""
+    hidden = {"type": "rectangle", "to_world": T().translate([0, 1, 0.4]).scale(0.45), "bsdf": twosided(RED)}
+    shapes = {**walls(6, twosided(RED)), "plate": hidden}
+    point = {"lamp": {"type": "point", "position": [0, 1, 0]}} if lamp else {}
+    scene = build(0.25, **shapes, **point)
+    backs = [mesh.name for mesh in scene.meshes[len(scene.fronts) :]]
+    assert backs == ([f"{name}_back" for name in shapes] if lamp else [])
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_a_dark_room_that_a_camera_is_in(camera):
+    """Its walls have rows for a camera's sake: a room may be so dark on purpose."""
+    pose = T().look_at([0, 1, 0], [0.1, 1, 0.3], [0, 1, 0])
+    sensor = {"sensor": {"type": "perspective", "to_world": pose}} if camera else {}
+    scene = build(0.25, **walls(6, twosided(RED)), **sensor)
+    assert len(scene.meshes) - len(scene.fronts) == (6 if camera else 0)
 
 
 @pytest.mark.usefixtures("no_held_out")
