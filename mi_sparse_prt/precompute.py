@@ -381,10 +381,11 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
             error = held_out_lamp_error(problem, transport, run.seed)
-        if target is None or error.total - 2 * error.standard_error["total"] <= target:
+        worst = error.in_view
+        if target is None or worst.total - 2 * worst.standard_error["total"] <= target:
             break
     if target is not None:
-        _warn_if_missed(error, settings, None)
+        _warn_if_missed(worst, settings, None)
     transport.report.update(
         _account(parts, problem, [])
         | {"estimated_error": error.report()}

@@ -29,6 +29,7 @@ from mi_sparse_prt.estimation.element_sampling import (
     for_direct_light,
     for_indirect_light,
 )
+from mi_sparse_prt.measurement.camera_shares import camera_shares
 from mi_sparse_prt.operators.operator import Operator
 from mi_sparse_prt.operators.sparse_rows import SparseRows
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
@@ -60,11 +61,14 @@ class Sample:
     squares, norms : (m, 1 + R) float64
         Unbiased estimates of what each adds to the squared error and the squared norm, summed over channels: of
         radiance, then of each of the R incident rows of a point.
+    seen : (m,) float64
+        How much of what cameras see each one's vertex is.
     """
 
     weights: NDArray[np.float64]
     squares: NDArray[np.float64]
     norms: NDArray[np.float64]
+    seen: NDArray[np.float64]
 
 
 Record = TypeVar("Record", Sample, Chosen)
@@ -92,6 +96,9 @@ class HeldOutError:
         Of glossy scenes: of each term's rows.
     dark : bool
         Whether next to no light arrives (``darkness``): errors relative to it do not count.
+    seen : float, optional
+        As `total`, of what the scene's cameras see (``camera_shares``), relative to that: a picture of a dim room is
+        not told of by an error relative to the sun outside. Its standard error has the same name.
     """
 
     total: float
@@ -101,10 +108,23 @@ class HeldOutError:
     parts: dict[str, float]
     terms: list[float]
     dark: bool = False
+    seen: float | None = None
+
+    @property
+    def in_view(self) -> HeldOutError:
+        """The same, whose total is that of what cameras see, if this is larger."""
+        if self.seen is None or self.seen <= self.total:
+            return self
+        spread = self.standard_error | {"total": self.standard_error["seen"]}
+        return replace(self, total=self.seen, standard_error=spread)
 
     def report(self) -> dict[str, Any]:
         """As JSON has it."""
-        return {name: value for name, value in vars(self).items() if name != "terms" or value}
+        return {
+            k: value
+            for k, value in vars(self).items()
+            if k not in ("terms", "seen") or value not in ([], None)
+        }
 
 
 def held_out_error(
@@ -141,7 +161,9 @@ def held_out_error(
     knows: the truth was within twice of it for all seeds.
     """
     stream = random_stream(seed, HELD_OUT)
-    estimator = _Estimator(problem, transport, effort, stream, indirect and problem.max_depth != 2)
+    indirect = indirect and problem.max_depth != 2
+    shares = seen_shares(problem) if target is None else np.zeros(len(problem.points))
+    estimator = _Estimator(problem, transport, effort, stream, indirect, shares)
     rng = np.random.default_rng(stream)
     open_square = float(unoccluded_squares(problem.reflection.albedo, problem.emission).sum())
     if target is None:
@@ -157,6 +179,12 @@ def held_out_error(
     return replace(found, dark=_squared_norm(samples) < rounds * DARK**2 * open_square)
 
 
+def seen_shares(problem: Problem) -> Doubles:
+    """How much of what cameras see each point (n,) is, on average 1; 0 without cameras, and of what is no vertex."""
+    n, known = len(problem.points), problem.measurement.kind == "vertices" and problem.scene.cameras
+    return n * camera_shares(problem.scene).astype(np.float64) if known else np.zeros(n)
+
+
 def _together(first: Samples, second: Samples) -> Samples:
     """Samples of which each stands for its mesh as one; weights matter relative to each other only."""
     return {key: _joined([first[key], more]) if key in first else more for key, more in second.items()}
@@ -168,22 +196,27 @@ def _joined(records: list[Record]) -> Record:
     return type(records[0])(*map(np.concatenate, parts))
 
 
-def estimate_errors(samples: Samples) -> HeldOutError:
-    """Relative L2 errors and standard errors."""
+def estimate_errors(samples: Samples, seen: Sequence[Sample] = ()) -> HeldOutError:
+    """Relative L2 errors and standard errors; of what cameras see by elements of its own, if there are any."""
     of_meshes: dict[str, Samples] = {}
     for key, sample in samples.items():
         of_meshes.setdefault(key[0], {})[key] = sample
     meshes = {name: _relative_of(some) for name, some in of_meshes.items()}
     total = _relative_of(samples)
+    own = {("seen", str(k)): sample for k, sample in enumerate(seen)} or samples
+    in_view = {key: replace(s, weights=s.weights * s.seen) for key, s in own.items()}
+    of_view = _relative_of(in_view) if _squared_norm(in_view) > 0 else None
     rows = max(sample.squares.shape[1] for sample in samples.values())
     glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
     return HeldOutError(
         total[0],
         {name: value for name, (value, _) in meshes.items()},
-        {"total": total[1], "meshes": {name: error for name, (_, error) in meshes.items()}},
+        {"total": total[1], "meshes": {name: error for name, (_, error) in meshes.items()}}
+        | ({} if of_view is None else {"seen": of_view[1]}),
         sum(len(sample.weights) for sample in samples.values()),
         _shares(samples),
         [relative(glossy, row)[0] for row in range(2, rows)],
+        seen=None if of_view is None else of_view[0],
     )
 
 
@@ -228,11 +261,13 @@ class _Estimator:
         effort: Effort,
         stream: np.random.SeedSequence,
         any_indirect: bool,
+        shares: Doubles,
     ) -> None:
         self._problem, self._transport, self._effort = problem, transport, effort
         self._any_indirect = any_indirect
         self._direct, self._indirect = transport.operators["direct"], transport.operators.get("indirect")
         self._seeds = element_seeds(stream, 4)
+        self._shares = shares
         self._rays = DirectSolver(problem, effort.strata, self._seeds[0])
         self._paths = PathSolver(problem, effort.spp, self._seeds[2])
         if isinstance(problem.reflection, InOutFactors):
@@ -273,6 +308,7 @@ class _Estimator:
         power = np.square(self._problem.reflection.albedo[ids].astype(np.float64))
         sums = [np.broadcast_to((a * b).sum(axis=1), power.shape) for a, b in ((ours - x, ours - y), (x, y))]
         columns = [np.stack([(power * s).sum(axis=1), s.sum(axis=1)], axis=1) for s in sums]
+        columns.append(self._shares[ids])
         ends = np.cumsum([len(rows) for rows, _ in draws])[:-1]
         parts = zip(*(np.split(array, ends) for array in (weights, *columns)), strict=True)
         return {
@@ -354,7 +390,8 @@ class _Estimator:
             own = first * second - variance  # [element, row, channel]
             of_rows = np.broadcast_to(own, (*own.shape[:2], 3)).sum(axis=2)  # one channel stands for three
             found.append(np.column_stack([_quadratic(gram, first, second, own), of_rows]))
-        return Sample(chosen.weights, *found)
+        squares, norms = found
+        return Sample(chosen.weights, squares, norms, self._shares[chosen.vertices])
 
     def _halves(self, chosen: Chosen) -> tuple[Doubles, Doubles]:
         """Direct light (m, rows, 1) twice, independently; it is the same where one ray tells all."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.element_sampling import draw_by_energy
-from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors
+from mi_sparse_prt.estimation.held_out import HELD_OUT, HeldOutError, Sample, estimate_errors, seen_shares
 from mi_sparse_prt.solvers.lamps import LampRays, LightByPaths
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.solvers.specular import SpecularOptions, specular_light
@@ -17,6 +17,7 @@ from mi_sparse_prt.transport import LightTransport
 
 ELEMENTS = 1 << 12  # in all, about. Twice as many told no more of a kitchen: 2.2 to 2.5% by four seeds
 LEAST = 2  # of each group
+SEEN = 1 << 11  # elements of what cameras see
 SPP = 256  # of 64, those of a lamp behind glass told an error of 0
 STRATA = 4  # per axis of a cell, of rays towards mirrors and glass
 BLOCK = 4096  # points at a time
@@ -35,6 +36,8 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     groups, energy, m = transport.measurement.groups, _energy(transport, albedo), problem.emission.size
     places = [slice(group.vertices.start * m, group.vertices.stop * m) for group in groups]
     drawn = [draw_by_energy(energy.ravel(), place, ELEMENTS, LEAST, rng) for place in places]
+    shares = _seen_shares(problem)
+    drawn += _drawn_where_seen(energy, shares, rng)
     elements, weights = (np.concatenate(part) for part in zip(*drawn, strict=True))
     asked = (
         elements // m,
@@ -45,12 +48,30 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     x, y = (_true(problem, asked, seen, *pair) for pair in (seeds[:2], seeds[2:]))
     power = albedo[asked[0]] ** 2
     sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x.light, ours - y.light), (x.all, y.all)))
-    columns = weights, *(column[:, None] for column in sums)
+    columns = weights, *(column[:, None] for column in sums), shares.ravel()[elements]
     ends = np.cumsum([len(one) for one, _ in drawn])[:-1]
-    parts = zip(*(np.split(column, ends) for column in columns), strict=True)
+    parts = [Sample(*some) for some in zip(*(np.split(column, ends) for column in columns), strict=True)]
     return estimate_errors(
-        {(group.name, "all"): Sample(*part) for group, part in zip(groups, parts, strict=True)}
+        {(g.name, "all"): part for g, part in zip(groups, parts, strict=False)}, parts[len(groups) :]
     )
+
+
+def _seen_shares(problem: Problem) -> Doubles:
+    """How much of what cameras see is each vertex, lit by lamps as bright as they are, squared (n, m)."""
+    brightness = getattr(problem.emission, "brightness", np.ones((problem.emission.size, 3)))
+    return seen_shares(problem)[:, None] * np.square(brightness, dtype=np.float64).mean(axis=1)
+
+
+def _drawn_where_seen(
+    energy: NDArray[np.float32], shares: Doubles, rng: np.random.Generator
+) -> list[tuple[NDArray[np.int64], Doubles]]:
+    """Elements that cameras see, and how many of these each stands for, if any have light."""
+    places = np.flatnonzero(shares)
+    bright = (energy * shares).ravel()[places]
+    if not bright.any():
+        return []
+    chosen, weights = draw_by_energy(bright, slice(0, len(bright)), SEEN, LEAST, rng)
+    return [(places[chosen], weights)]
 
 
 def _energy(transport: LightTransport, albedo: Doubles) -> NDArray[np.float32]:

@@ -278,6 +278,11 @@ class Scene:
         ]  # of which none shines, if it is of several shapes
         return ShapeTable([self.normalised.mitsuba, self.unsplit.mitsuba], np.tile(of_runs, 2))
 
+    @property
+    def cameras(self) -> list[mi.Sensor]:
+        """Sensors that belong to no shape."""
+        return [thing for thing in self._others if isinstance(thing, mi.Sensor)]
+
     def sensor(self, sensor: int | mi.Sensor) -> mi.Sensor:
         """One of the scene's own cameras by its number; a sensor is passed on.
 

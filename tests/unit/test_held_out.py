@@ -43,7 +43,7 @@ def held_out_error(
 
 def row_sample(weights: np.ndarray, squares: np.ndarray, norms: np.ndarray) -> Sample:
     """Of one quantity."""
-    return Sample(weights, np.asarray(squares)[:, None], np.asarray(norms)[:, None])
+    return Sample(weights, np.asarray(squares)[:, None], np.asarray(norms)[:, None], np.zeros(len(weights)))
 
 
 @cache

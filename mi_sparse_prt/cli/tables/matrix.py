@@ -89,6 +89,8 @@ def _error_table(transport: prt.LightTransport) -> Table:
         errors = error["meshes"][mesh.name], deviations["meshes"][mesh.name]
         meshes.append((mesh.name, f"{mesh.vertices.stop - mesh.vertices.start:,}", *map(percent, errors)))
     total = [("total", f"{transport.shape[0]:,}", percent(error["total"]), percent(deviations["total"]))]
+    if "seen" in error:
+        total.append(("seen by cameras", "", percent(error["seen"]), percent(deviations["seen"])))
     if target is not None:
         total.append(("target", "", percent(target), ""))
     title = "Estimated error (relative L2, from held-out elements)"
