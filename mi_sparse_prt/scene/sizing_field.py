@@ -66,13 +66,18 @@ class SizingField:
         _, tree = self.pieces[-1]
         return Details(np.median(tree.data, axis=0), self.shortest / self.longest)
 
-    def __call__(self, points: Doubles) -> Doubles:
-        """Of edges whose midpoints are these, (n, 3), world units: (n,)."""
-        length = np.full(len(points), self.longest)
-        for shortest, tree in self.pieces:
-            distance, _ = tree.query(points, distance_upper_bound=self.longest / GRADE)
-            length = np.minimum(length, np.maximum(shortest, GRADE * distance))
-        return length
+    def exceeded(self, points: Doubles, lengths: Doubles) -> NDArray[np.bool_]:
+        """Which edges (n,) are longer than they may be, of so long ones with these midpoints (n, 3), world units."""
+        long = lengths > self.longest * (1 + TIE)
+        octaves = np.floor(np.log2(np.maximum(lengths, 1e-300)))
+        for shortest, tree in reversed(self.pieces):
+            some = np.flatnonzero(~long & (lengths > shortest * (1 + TIE)))
+            for octave in np.unique(octaves[some]):
+                # what is farther from pieces may be as long: a search that ends there takes far less time
+                own, reach = some[octaves[some] == octave], 2 ** (octave + 1) / GRADE
+                distances, _ = tree.query(points[own], distance_upper_bound=reach, workers=-1)
+                long[own] = lengths[own] > GRADE * distances * (1 + TIE)
+        return long
 
 
 def refine_near_details(
@@ -170,7 +175,7 @@ def _ends_of_long_edges(mesh: TriangleMesh, field: SizingField) -> NDArray[np.in
     a, b = (mesh.positions[ends].astype(np.float64) for ends in (start, end))
     length = np.linalg.norm(b - a, axis=1)
     some = np.flatnonzero(length > field.shortest * (1 + TIE))
-    ends: NDArray[np.int32] = start[some[length[some] > field((a[some] + b[some]) / 2) * (1 + TIE)]]
+    ends: NDArray[np.int32] = start[some[field.exceeded((a[some] + b[some]) / 2, length[some])]]
     return ends
 
 

@@ -28,8 +28,8 @@ class EdgeLength(Protocol):
     def shortest(self) -> float:
         """Anywhere."""
 
-    def __call__(self, points: Doubles) -> Doubles:
-        """Of edges whose midpoints are these, (n, 3): (n,)."""
+    def exceeded(self, points: Doubles, lengths: Doubles) -> NDArray[np.bool_]:
+        """Which edges (n,) are longer, of so long ones with these midpoints (n, 3)."""
 
 
 class TooManyVerticesError(PrtError):
@@ -77,11 +77,11 @@ def subdivide(
     TooManyVerticesError
         If more than `limit` vertices would be needed.
     """
-    if callable(edge_length):
-        shortest = edge_length.shortest
-    else:
-        shortest = edge_length
+    if isinstance(edge_length, float | int):
+        shortest = float(edge_length)
         _check_area(mesh, shortest, limit)
+    else:
+        shortest = edge_length.shortest
     before = mesh
     while True:
         t = mesh.triangles
@@ -94,8 +94,8 @@ def subdivide(
         a, b = (mesh.positions.astype(np.float64)[ends[:, k]] for k in (0, 1))
         length = np.linalg.norm(a - b, axis=1)
         long = length > shortest * (1 + TIE)
-        if callable(edge_length):
-            long[long] = length[long] > edge_length((a[long] + b[long]) / 2) * (1 + TIE)
+        if not isinstance(edge_length, float | int):
+            long[long] = edge_length.exceeded((a[long] + b[long]) / 2, length[long])
         if not long.any():
             was_split = mesh is not before and is_flat(before)
             return replace(mesh, unsplit=before.unsplit or before) if was_split else mesh
