@@ -399,8 +399,8 @@ def _no_indirect(problem: Problem, settings: Settings, clock: Stopwatch) -> str 
     """Why there is no indirect light, or None."""
     if settings.max_depth == 2:
         return "max_depth 2 asks for direct light only"
-    if problem.scene.diffuse and not problem.reflection.albedo.any():
-        return "every surface is black"
+    if problem.sent is None and not problem.reflection.importance.any():
+        return "every surface is black, or sends all light on as mirrors and glass do"
     with clock.phase("pilot"):
         surfaces_meet = indirect_solver(problem, settings).any_hit(_PILOT_RAYS)
     return None if surfaces_meet else "no surface sees another one"

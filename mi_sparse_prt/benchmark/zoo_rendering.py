@@ -108,8 +108,7 @@ def render_matrix(path: Path, effort: ZooEffort, **parameters: Any) -> Rendering
         seconds = time.perf_counter() - start
         second = _picture(scene, integrator, effort.spp, seed=1)
         matrices = [load_transport(file) for file in Path(folder).glob("*.prt")]
-    told = [matrix.report["estimated_error"] for matrix in matrices]
-    estimates = [max(one["total"], one.get("seen", 0.0)) for one in told]
+    estimates = [matrix.report["estimated_error"]["total"] for matrix in matrices]
     said = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, PrtWarning))
     return Rendering((first, second), seconds, max(estimates, default=None), list(said))
 

@@ -299,7 +299,10 @@ class _Pilot:
             (rays.data, np.arange(len(row)), rays.indptr), shape=(len(texels), len(row))
         )
         reflected = seen[:, :, None] * self._albedo[rays.indices][:, None]  # [entry, texel, channel]
-        return (mean @ reflected.reshape(len(row), -1)).reshape(*texels.shape, -1).astype(np.float64)
+        size = (
+            texels.shape[1] * self._albedo.shape[1]
+        )  # where rays find nothing, there are no entries to count it by
+        return (mean @ reflected.reshape(len(row), size)).reshape(*texels.shape, -1).astype(np.float64)
 
     def spectra(self, stream: np.random.SeedSequence) -> NDArray[np.float64]:
         """Energy of the first bounce beyond each rank, relative, in half a sample and in all of it (2, k)."""

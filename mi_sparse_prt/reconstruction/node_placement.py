@@ -37,7 +37,7 @@ def node_count(scene: Scene, most: int = NODES, small: int = SMALL) -> int:
     """How many nodes ``choose_nodes`` chooses, about."""
     if scene.n_vertices <= most:
         return scene.n_vertices
-    return int(_wanted(np.bincount(scene.pieces), most, small).sum())
+    return int(_wanted(_sizes(scene), most, small).sum())
 
 
 def choose_nodes(
@@ -45,8 +45,9 @@ def choose_nodes(
 ) -> Nodes:
     """About ``most`` vertices, evenly spread among those of each connected piece of a mesh; all of small pieces.
 
-    Light is interpolated within pieces: leaves of a tree are near each other and look elsewhere. Which ones are chosen
-    depends on where vertices are and on their keys, not on their order, nor on how pieces are shared out among meshes.
+    Light is interpolated within pieces: leaves of a tree are near each other and look elsewhere. Those that send
+    nothing on, such as glass, have no nodes and no light. Which vertices are chosen depends on where these are and on
+    their keys, not on their order, nor on how pieces are shared out among meshes.
 
     Parameters
     ----------
@@ -67,9 +68,9 @@ def choose_nodes(
     n = scene.n_vertices
     if n <= most:
         return Nodes(np.arange(n), None)
-    sizes = np.bincount(scene.pieces)
+    sizes = _sizes(scene)
     wanted = _wanted(sizes, most, small)
-    every = np.flatnonzero((wanted == sizes)[scene.pieces])
+    every = np.flatnonzero(((wanted == sizes) & (sizes > 0))[scene.pieces])
     found, walls = [_Weights(every, every, np.ones(len(every), np.float32))], Walls(scene, points)
     for piece in np.flatnonzero(wanted < sizes):
         members = np.flatnonzero(scene.pieces == piece)
@@ -113,6 +114,12 @@ def nodes_among(
             some = own[near.nodes[:, 0] >= 0]  # others see no node, and are their own
             found.nodes[some], found.weights[some] = (part[near.nodes[:, 0] >= 0] for part in near)
     return found
+
+
+def _sizes(scene: Scene) -> Ids:
+    """Vertices of each piece; 0 of those that send nothing on, if others do: nobody asks what they receive."""
+    sizes, sent = np.bincount(scene.pieces), np.bincount(scene.pieces, scene.sent_albedo.max(axis=1))
+    return np.where((sent > 0) | (not sent.any()), sizes, 0)
 
 
 def _wanted(sizes: Ids, most: int, small: int) -> Ids:

@@ -2,14 +2,17 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 from conftest import COLOURS, T, build, diffuse, mesh, problem_at, still_life
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.measurement.vertices import Points, vertex_points
 from mi_sparse_prt.methods import execution
 from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.planner.radiosity_costs import _Pilot
 from mi_sparse_prt.reconstruction import node_placement
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 from mi_sparse_prt.solvers.surface_nodes import Nodes
 
@@ -160,3 +163,31 @@ def test_glossy_vertices_have_terms_of_their_own(monkeypatch):
     for rows in (slice(n), slice(n, None)):
         assert np.linalg.norm(light[rows] - known[rows]) < 0.08 * np.linalg.norm(known[rows])
         assert light[rows].mean() == pytest.approx(known[rows].mean(), rel=0.01)
+
+
+def test_what_sends_nothing_on_has_no_nodes():
+    """A ball of glass above a floor; and alone, where others must not fail for want of nodes."""
+    glass = {"type": "sphere", "radius": 0.4, "center": [0, 1, 0], "bsdf": {"type": "dielectric"}}
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": diffuse(0.5, 0.5, 0.5)}
+    scene = build(0.05, optimize=False, ball=glass, floor=floor)
+    ball, plane = (mesh.vertices for mesh in scene.meshes)
+    nodes = choose_nodes(scene, vertex_points(scene), 400)
+    assert nodes.ids.min() >= plane.start and 300 < len(nodes) < 500
+    light = nodes.interpolate(np.ones((len(nodes), 1), np.float32))
+    assert light[plane] == pytest.approx(1, abs=1e-5) and not light[ball].any()
+    alone = build(0.05, ball=glass)
+    assert len(choose_nodes(alone, vertex_points(alone), 400)) > 300
+
+
+@pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
+def test_glass_alone_keeps_no_light():
+    """Expected: no rays for light that no surface keeps, and a matrix of zeros; a picture shows the sky behind."""
+    scene = build(0.1, ball={"type": "sphere", "bsdf": {"type": "dielectric"}})
+    found = prt.precompute(scene, prt.CubemapLighting(4), target_error=0.05, progress=False)
+    assert not found.rows(np.arange(scene.n_vertices)).any()
+    assert any("every surface is black, or sends all light on" in line for line in found.report["skipped"])
+    assert "specular" not in found.operators
+    # where a pilot's rays find nothing that keeps light
+    pilot = _Pilot(DirectSolver(problem_at(scene, prt.CubemapLighting(4))), np.arange(5))
+    rays = scipy.sparse.csr_array((5, scene.n_vertices), dtype=np.float32)
+    assert not pilot.light(rays, np.zeros((5, 3), np.int64)).any()
