@@ -47,6 +47,7 @@ ROUNDING = 1e-5  # relative errors below are those of float32
 HELD_OUT = 1  # spawn key
 BATCH = 1 << 20  # elements, evaluated together
 ROUND = 0.25  # of the elements: these mostly tell whether a target is met
+UNKNOWN = 0.5  # a standard error of what is seen, from which on nothing is said: next to no light is there
 KNOWN = 0.1  # of a target: an error that is known so well, and still about the target, is left at that
 
 
@@ -206,6 +207,8 @@ def estimate_errors(samples: Samples, seen: Sequence[Sample] = ()) -> HeldOutErr
     own = {("seen", str(k)): sample for k, sample in enumerate(seen)} or samples
     in_view = {key: replace(s, weights=s.weights * s.seen) for key, s in own.items()}
     of_view = _relative_of(in_view) if _squared_norm(in_view) > 0 else None
+    if of_view is not None and of_view[1] > UNKNOWN:
+        of_view = None
     rows = max(sample.squares.shape[1] for sample in samples.values())
     glossy = [sample for sample in samples.values() if sample.squares.shape[1] == rows]
     return HeldOutError(

@@ -7,7 +7,7 @@ import pytest
 from conftest import T, build, diffuse
 
 import mi_sparse_prt as prt
-from mi_sparse_prt.estimation.held_out import held_out_error
+from mi_sparse_prt.estimation.held_out import Sample, estimate_errors, held_out_error
 from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.camera_shares import camera_shares
 from mi_sparse_prt.measurement.measurement import mesh_vertices
@@ -120,3 +120,14 @@ def test_a_lamp_is_told_of_as_it_is_seen():
     found = held_out_lamp_error(problem, replace(transport, operators=parts), 0)
     assert found.seen == pytest.approx(0.3, rel=0.25)
     assert found.total < found.seen / 3
+
+
+def test_nothing_is_said_of_what_is_dark():
+    """Noise of next to no light, and an error of 10% where there is some."""
+    rng, n = np.random.default_rng(0), 1000
+    for light, told in ((1.0, 0.1), (1e-4, None)):
+        norms = light + 0.01 * rng.standard_normal(n)
+        squares = 0.01 * light + 1e-3 * rng.standard_normal(n)
+        sample = Sample(np.ones(n), squares[:, None], norms[:, None], np.ones(n))
+        found = estimate_errors({("floor", "direct"): sample}).seen
+        assert found == (None if told is None else pytest.approx(told, rel=0.05))
