@@ -54,6 +54,6 @@ def _rays_of(sensor: mi.Sensor, scene: Scene) -> mi.Ray3f:
     number = dr.arange(mi.UInt32, ACROSS**2)
     row = number // ACROSS
     place = (mi.Point2f(mi.Float(number - row * ACROSS), mi.Float(row)) + 0.5) / ACROSS
-    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5))
     origins = (ray.o.numpy().T.astype(np.float64) - scene.centre) * scene.scale
     return mi.Ray3f(mi.Point3f(np.ascontiguousarray(origins.T.astype(np.float32))), ray.d)

@@ -299,9 +299,8 @@ class _Pilot:
             (rays.data, np.arange(len(row)), rays.indptr), shape=(len(texels), len(row))
         )
         reflected = seen[:, :, None] * self._albedo[rays.indices][:, None]  # [entry, texel, channel]
-        size = (
-            texels.shape[1] * self._albedo.shape[1]
-        )  # where rays find nothing, there are no entries to count it by
+        # where rays find nothing, there are no entries to count it by
+        size = texels.shape[1] * self._albedo.shape[1]
         return (mean @ reflected.reshape(len(row), size)).reshape(*texels.shape, -1).astype(np.float64)
 
     def spectra(self, stream: np.random.SeedSequence) -> NDArray[np.float64]:

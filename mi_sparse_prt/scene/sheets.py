@@ -22,12 +22,10 @@ from mi_sparse_prt.scene.ray_offsets import ray_offset
 from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, find_pieces
 
-FEW_WAYS, MANY_WAYS = (
-    64,
-    4096,
-)  # from each piece of a surface: most find light at once, the others look closely
+# from each piece of a surface: most find light at once, the others look closely
+FEW_WAYS, MANY_WAYS = 64, 4096
 LEAKS = 1e-4  # of the ways from a piece, which slip through where surfaces meet
-LONGEST = 8  # surfaces on a way, those that light goes through apart
+LONGEST, THROUGH = 8, 8  # surfaces on a way; so many that light goes through count as one
 LANES = 1 << 22  # rays per wavefront
 INSIDE = 0.85  # rays start this far inside of triangles: at their borders they leak through other surfaces
 
@@ -214,7 +212,7 @@ class _Looks:
     @dr.syntax
     def _finds_light(self, ray: mi.Ray3f, rng: mi.PCG32) -> mi.Mask:
         """Whether ways lead to light that begin with these rays, and go on as from white diffuse surfaces."""
-        active, found, left = mi.Mask(True), mi.Mask(False), dr.opaque(mi.UInt32, LONGEST)
+        active, found, left = mi.Mask(True), mi.Mask(False), dr.opaque(mi.Int32, LONGEST * THROUGH)
         while active:
             hit = self._scene.ray_intersect_preliminary(ray, active)
             met = active & hit.is_valid()
@@ -235,7 +233,7 @@ class _Looks:
                 found |= asked & ~self._scene.ray_test(_up_to(place, towards), asked)
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
             ray = mi.Ray3f(place, dr.select(passes, ray.d, mi.Frame3f(side).to_world(local)))
-            left -= dr.select(passes, 0, 1)
+            left -= dr.select(passes, 1, THROUGH)
             active = met & ~found & (left > 0)
             active &= passes | ~(behind & dr.gather(mi.Bool, self._black, index, met))
         return found
