@@ -571,7 +571,9 @@ def test_few_rows_stand_for_all():
     plan = Plan("edges", "gather", 64, 0.1)
     transport = prt.precompute(scene, lighting, plan, "texel", problem.max_depth, progress=False)
     effort = Effort(specular=64)
-    estimator = _Estimator(problem, transport, effort, np.random.SeedSequence(1), False, np.zeros(scene.n_vertices))
+    estimator = _Estimator(
+        problem, transport, effort, np.random.SeedSequence(1), False, np.zeros(scene.n_vertices)
+    )
     energy, rng, found = estimator._specular_energy, np.random.default_rng(2), []
     parts = transport.operators["specular"].by_depth
     squares = sum(

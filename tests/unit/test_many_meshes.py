@@ -115,7 +115,9 @@ def test_drawn_elements_stand_for_all(count):
     transport = prt.precompute(scene, LIGHTING, Plan("exact"), max_depth=2, progress=False)
     exact = float((transport.rows(np.arange(scene.n_vertices)).astype(np.float64) ** 2).sum())
     problem = diffuse_problem(scene, LIGHTING, max_depth=2)
-    estimator = _Estimator(problem, transport, Effort(), np.random.SeedSequence(3), False, np.zeros(scene.n_vertices))
+    estimator = _Estimator(
+        problem, transport, Effort(), np.random.SeedSequence(3), False, np.zeros(scene.n_vertices)
+    )
     found = []
     for seed in range(40):
         samples = estimator.samples(np.random.default_rng(seed), 1.0).values()
