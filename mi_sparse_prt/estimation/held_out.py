@@ -121,11 +121,7 @@ class HeldOutError:
 
     def report(self) -> dict[str, Any]:
         """As JSON has it."""
-        return {
-            k: value
-            for k, value in vars(self).items()
-            if k not in ("terms", "seen") or value not in ([], None)
-        }
+        return {name: value for name, value in vars(self).items() if value not in ([], None)}
 
 
 def held_out_error(

@@ -1,7 +1,7 @@
 """Two-sided surfaces: which of their backs light can reach; these have vertices of their own.
 
 A surface that reflects on both sides has two sheets. The backs of most are the insides of closed solids, where it is
-dark. They see fronts as well: solids stand in and on each other, and a floor goes on below a sofa. But no way from
+dark. They see fronts as well: solids stand in and on each other, and a floor goes on below a sofa. But no walk from
 surface to surface leads from there to light. Such sheets have no rows.
 """
 
@@ -23,14 +23,14 @@ from mi_sparse_prt.scene.traced_scene import TracedScene
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, find_pieces
 
 # from each piece of a surface: most find light at once, the others look closely
-FEW_WAYS, MANY_WAYS = 64, 4096
-LEAKS = 1e-4  # of the ways from a piece, which slip through where surfaces meet
-LONGEST, THROUGH = 8, 8  # surfaces on a way; so many that light goes through count as one
+FEW_WALKS, MANY_WALKS = 64, 4096
+LEAKS = 1e-4  # of the walks from a piece, which slip through where surfaces meet
+LONGEST, THROUGH = 8, 8  # surfaces of a walk; so many that light goes through count as one
 LANES = 1 << 22  # rays per wavefront
 INSIDE = 0.85  # rays start this far inside of triangles: at their borders they leak through other surfaces
 
 NO_PIECE = -1  # of a triangle whose back is no sheet
-SCATTERS, PASSES, SHINES = 0, 1, 2  # what triangles do with a way
+SCATTERS, PASSES, SHINES = 0, 1, 2  # what a walk does at a triangle
 
 Ids = NDArray[np.int64]
 
@@ -63,7 +63,7 @@ def find_backs(
 ) -> tuple[list[Back], list[str]]:
     """The backs of two-sided surfaces that light can reach, and the names of shapes that have others as well.
 
-    Light reaches a connected piece of a surface if a random way from its back, from surface to surface, leaves the
+    Light reaches a connected piece of a surface if a random walk from its back, from surface to surface, leaves the
     scene, or meets an area lamp or a place that another lamp shines on.
 
     Parameters
@@ -79,15 +79,15 @@ def find_backs(
 
     Notes
     -----
-    A piece counts as dark if none of 4096 or more ways, at least one from each of its triangles, finds light, or one in
-    ten thousand: then less than a thousandth of what would reach it in the open does, with a probability of 98%.
+    A piece counts as dark if none of 4096 or more walks, at least one from each of its triangles, finds light, or one
+    in ten thousand: then less than a thousandth of what would reach it in the open does, with a probability of 98%.
     """
     if not any(material.two_sided for material in materials):
         return [], []
     pieces = _pieces(meshes, materials)
     none = np.zeros((0, 3), np.float32)
-    looks = _Looks(scene, meshes, materials, pieces, none if lamps is None else lamps)
-    bright = _bright_pieces(looks, pieces, none if cameras is None else cameras)
+    from_surfaces = _Walks(scene, meshes, materials, pieces, none if lamps is None else lamps)
+    bright = _bright_pieces(from_surfaces, pieces, none if cameras is None else cameras)
     found, dark, first = [], [], 0
     for shape, mesh in enumerate(meshes):
         own = pieces[first : first + len(mesh.triangles)]
@@ -124,26 +124,26 @@ def _pieces(meshes: Sequence[TriangleMesh], materials: Sequence[Material]) -> Id
     return np.concatenate(result)
 
 
-def _bright_pieces(looks: _Looks, pieces: Ids, cameras: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _bright_pieces(from_surfaces: _Walks, pieces: Ids, cameras: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which pieces light reaches, or are seen, (pieces,) bool."""
     bright = np.zeros(int(pieces.max()) + 1, np.bool_)
     for place in cameras:
-        bright[looks.from_place(place)] = True
+        bright[from_surfaces.from_place(place)] = True
     size = np.bincount(pieces[pieces >= 0], minlength=len(bright))
-    for pass_, ways in enumerate((FEW_WAYS, MANY_WAYS)):
+    for pass_, walks in enumerate((FEW_WALKS, MANY_WALKS)):
         some = np.flatnonzero(pieces >= 0)
         some = some[~bright[pieces[some]]]
-        each = -(-ways // size[pieces[some]])  # ways from each triangle
+        each = -(-walks // size[pieces[some]])  # walks from each triangle
         lit = np.zeros(len(bright), np.int64)
-        for a in range(0, len(some), LANES // ways):
-            part = slice(a, a + LANES // ways)
-            lit += looks.from_backs(some[part], each[part], pass_)
-        bright |= lit > LEAKS * -(-ways // size) * size
+        for a in range(0, len(some), LANES // walks):
+            part = slice(a, a + LANES // walks)
+            lit += from_surfaces.from_backs(some[part], each[part], pass_)
+        bright |= lit > LEAKS * -(-walks // size) * size
     return bright
 
 
-class _Looks:
-    """Ways from the backs of triangles, and whether they find light.
+class _Walks:
+    """Random walks from the backs of triangles, and whether they find light.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class _Looks:
         self._keys = mi.UInt64(hash_rows(corners.sum(axis=1)))
 
     def from_backs(self, triangles: Ids, each: Ids, seed: int) -> Ids:
-        """How many ways from each piece (pieces,) find light, of some triangles with so many ways each."""
+        """How many walks from each piece (pieces,) find light, of some triangles with so many walks each."""
         start = np.repeat(triangles, each)
         sample = np.arange(len(start)) - np.repeat(np.cumsum(each) - each, each)
         triangle, number = (on_device(mi.UInt32, x.astype(np.uint32)) for x in (start, sample))
@@ -199,7 +199,7 @@ class _Looks:
 
     def from_place(self, place: NDArray[np.float32]) -> Ids:
         """Pieces whose backs are seen from a point (3,), looking around."""
-        rng = mi.PCG32(size=MANY_WAYS)
+        rng = mi.PCG32(size=MANY_WALKS)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         ray = mi.Ray3f(mi.Point3f(place), direction)
         hit = self._scene.ray_intersect_preliminary(ray)
@@ -211,7 +211,7 @@ class _Looks:
 
     @dr.syntax
     def _finds_light(self, ray: mi.Ray3f, rng: mi.PCG32) -> mi.Mask:
-        """Whether ways lead to light that begin with these rays, and go on as from white diffuse surfaces."""
+        """Whether random walks find light that begin with these rays and go on as from white diffuse surfaces."""
         active, found, left = mi.Mask(True), mi.Mask(False), dr.opaque(mi.Int32, LONGEST * THROUGH)
         while active:
             hit = self._scene.ray_intersect_preliminary(ray, active)

@@ -58,7 +58,7 @@ class Strata(NamedTuple):
 
 def importance_of(problem: Problem) -> Floats:
     """How much light counts at points (n,), 1 where most of it counts: what they make of it, or their mesh does."""
-    own = problem.over_meshes(problem.reflection.importance)
+    own = problem.raise_to_mesh_mean(problem.reflection.importance)
     whole = np.square(own, dtype=np.float64)
     return (own * (whole.sum() / max(float((whole * own).sum()), 1e-30))).astype(np.float32)
 

@@ -49,7 +49,7 @@ class BentLight:
         self._chains, self._ids, self._power, self._seeds = SpecularChains(problem), ids, power, iter(seeds)
         self._size = problem.emission.size * max(problem.depths_apart, 1)
         self._keys = problem.points.keys[np.asarray(ids)]
-        albedo = problem.over_meshes(problem.reflection.albedo.max(axis=1))[ids].astype(np.float64)
+        albedo = problem.raise_to_mesh_mean(problem.reflection.albedo.max(axis=1))[ids].astype(np.float64)
         lit = np.flatnonzero(albedo)
         cells = self._chains.find_cells(ids[lit], next(self._seeds))
         self._cells = cells._replace(rows=lit[cells.rows])

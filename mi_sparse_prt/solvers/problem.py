@@ -71,7 +71,7 @@ class Problem:
         """1 in a grey scene, else 3."""
         return 1 if self.scene.grey else 3
 
-    def over_meshes(self, importance: NDArray[np.float32]) -> NDArray[np.float32]:
+    def raise_to_mesh_mean(self, importance: NDArray[np.float32]) -> NDArray[np.float32]:
         """What counts at points (n,); at vertices no less than on average over their mesh (root mean square).
 
         They are few beside the texels of a texture: pictures have others between them.

@@ -49,7 +49,7 @@ def test_shares_are_those_of_the_film():
     shares = of_meshes(build(0.1, sensor=view, **shapes))
     assert shares["hidden"] == shares["back"] == 0
     assert shares["near"] + shares["far"] == pytest.approx(1)
-    assert shares["near"] / shares["far"] == pytest.approx(4, rel=0.05)
+    assert shares["near"] / shares["far"] == pytest.approx(4, rel=0.02)
     assert not camera_shares(build(0.1, **shapes)).any()
 
 
