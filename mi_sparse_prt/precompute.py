@@ -25,7 +25,7 @@ from mi_sparse_prt.estimation.held_out_lamps import held_out_lamp_error
 from mi_sparse_prt.measurement.measurement import Measurement, mesh_vertices
 from mi_sparse_prt.methods.brute_force import share_above_horizon
 from mi_sparse_prt.methods.execution import Execution, indirect_solver, matrix_of
-from mi_sparse_prt.methods.lamps import SPP, gathered_lamps, path_traced_lamps
+from mi_sparse_prt.methods.lamps import gathered_lamps, path_traced_lamps
 from mi_sparse_prt.methods.plan import EFFORTS, Plan
 from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
@@ -76,8 +76,8 @@ def precompute(
     scene : Scene
     lighting : CubemapLighting, SceneEmitters, or another ``emission.space.SampledEmission``
         The emission space: one column per texel, or per lamp. Of lamps, ``method`` is ``"gather"`` (diffuse scenes, the
-        default there) or ``"brute_force"`` (64 paths per element or as many photons, or ``spp``; more where
-        they spread).
+        default there) or ``"brute_force"`` (64 paths per element or as many photons, or ``spp``, or fewer if there
+        are many lamps and vertices; more where they spread).
     method : {"auto", "brute_force", "sparse", "huang2010", "gather"} or Plan
         What is evaluated, and how. ``"auto"`` measures on a few hundred vertices what rays, paths and gathering cost
         in this scene on this machine, predicts time and error of all plans, and takes the quickest that meets the
@@ -375,8 +375,8 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
     if method == "gather" or (method == "auto" and problem.scene.diffuse):
         settings, attempts = replace(settings, method="gather"), [gathered_lamps(problem, run, seen=seen)]
     else:
-        settings = replace(settings, method="brute_force", spp=settings.spp or SPP)
-        attempts = path_traced_lamps(problem, run, settings.samples, target, seen=seen)
+        settings = replace(settings, method="brute_force")
+        attempts = path_traced_lamps(problem, run, settings.spp, target, seen=seen)
     for parts in attempts:
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
@@ -390,7 +390,7 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         _account(parts, problem, [])
         | {"estimated_error": error.report()}
         | _costs(transport, run.clock)
-        | _inputs(problem, settings)
+        | _inputs(problem, replace(settings, spp=parts.spp))
     )
     return transport
 

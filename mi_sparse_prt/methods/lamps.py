@@ -30,7 +30,11 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 BLOCK = 4096  # points at a time
 NOISE = 0.02  # of light that mirrors and glass bring, relative L2, of direct light together with it
 FEWER = "paths of some lamps: fewer than {} of an element, as the target error asks for no more"
-SPP = 64  # paths of an element, where nothing else says how many
+SPP = 64  # paths of an element, where nothing else says how many: what is left of their grain is hardly seen
+# in all, where SPP of each would be more: half a minute. Noise of many lamps averages out in pictures
+PATHS = 1 << 25
+LEAST = 4  # paths of an element, however many these are
+SHARED = "paths of lamps: {} of an element, not {}, as there are {:.0f} million elements; ask for more by spp"
 
 
 def gathered_lamps(
@@ -70,17 +74,18 @@ def gathered_lamps(
 def path_traced_lamps(
     problem: Problem,
     run: Run,
-    spp: int = SPP,
+    spp: int | None = None,
     target: float | None = None,
     strata: int = 16,
     seen: bool = True,
 ) -> Iterator[MethodResult]:
     """By paths and photons: any BSDF; at least ``spp`` paths of an element, or as many photons; noise is averaged out.
 
-    Indirect light is told apart by how many surfaces it met: where not all are diffuse, cameras' rays go on from some,
-    and meet them as well. In scenes of more than 65,536 vertices light is found at nodes, between which it is
-    interpolated. With a ``target``, lamps of whose indirect light fewer paths leave so little noise (relative L2) have
-    fewer; such a result says so in ``skipped``, and a next one, by ``spp`` paths, follows. See ``gathered_lamps``.
+    Without ``spp`` these are 64, or fewer where there are many lamps and points. Indirect light is told apart by how
+    many surfaces it met: where not all are diffuse, cameras' rays go on from some, and meet them as well. In scenes of
+    more than 65,536 vertices light is found at nodes, between which it is interpolated. With a ``target``, lamps of
+    whose indirect light fewer paths leave so little noise (relative L2) have fewer; such a result says so in
+    ``skipped``, and a next one, by ``spp`` paths, follows. See ``gathered_lamps``.
     """
     direct, rays = _direct(problem, run, strata) if seen else (None, {})
     if problem.max_depth == 2:
@@ -89,19 +94,23 @@ def path_traced_lamps(
     m, apart = problem.emission.size, 0 if problem.scene.diffuse else told_apart(problem.max_depth)
     with run.clock.phase("smoothing"):
         places = _places(problem)
+    elements, skipped = len(places.ids) * m, []
+    if spp is None:
+        spp = max(LEAST, min(SPP, PATHS // max(elements, 1)))
+        skipped = [] if spp == SPP else [SHARED.format(spp, SPP, elements / 1e6)]
     with run.clock.phase("indirect"):
         light = LampLight(problem, places.ids, places.nodes, places.levels, spp, run.seed, max(apart, 1))
         # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur
         least = None if target is None else light.effort(target / 2)
     every = np.full(m, spp)
     for effort in (every,) if least is None or (least == spp).all() else (least, every):
-        with run.clock.phase("indirect"), run.bar(len(places.ids) * m, "indirect") as bar:
+        with run.clock.phase("indirect"), run.bar(elements, "indirect") as bar:
             found = light.estimate(effort, bar.update)
         with run.clock.phase("smoothing"):
             every_light = places.light(found, m)
         indirect = Dense(every_light) if apart == 0 else _by_depth(every_light, apart)
         result = _result(direct, indirect, rays | light.rays)
-        yield replace(result, skipped=[FEWER.format(spp)] if effort is least else [])
+        yield replace(result, spp=spp, skipped=skipped + ([FEWER.format(spp)] if effort is least else []))
 
 
 class _Places(NamedTuple):

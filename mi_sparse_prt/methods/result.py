@@ -39,6 +39,8 @@ class MethodResult:
         rays take away).
     dense : (k,) int64 or None
         Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
+    spp : int or None
+        Paths of an element, at least, if the method chose how many.
     """
 
     direct: Operator | None
@@ -51,3 +53,4 @@ class MethodResult:
     sampling: dict[str, Any] = field(default_factory=dict)
     radiosity: dict[str, Any] = field(default_factory=dict)
     dense: NDArray[np.int64] | None = None
+    spp: int | None = None

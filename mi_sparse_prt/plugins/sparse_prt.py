@@ -21,7 +21,6 @@ from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
 from mi_sparse_prt.relighting.sharp_light import sharp_light
 from mi_sparse_prt.scene.scene import Scene
 
-LAMP_SPP = 64  # paths per vertex and lamp, where paths are traced: what is left of their grain is hardly seen
 _UNSEEN = "DirectionalArea"  # no path from a camera finds its light, those of ``path`` neither
 
 
@@ -79,7 +78,7 @@ class SparsePRT(mi.SamplingIntegrator):
     basis               string     ``direction`` or ``texel``: light from a texel's centre or all of it. (texel)
     max_depth           integer    As for ``path``; 2 is direct light only. (5)
     precompute_spp      integer    Paths per indirect element, where there are any. (``auto`` chooses, or 16; of lamps
-                                   64, where ``target_error`` does not take fewer)
+                                   64, or fewer for ``target_error``, or if there are many lamps and vertices)
     indirect_resolution integer    Texels along an edge of the cubemap of path-traced indirect light. (``auto``
                                    chooses; of ``brute_force`` 8, or ``resolution``)
     target_error        float      Relative L2 error of the environment's matrix to aim at, and of the noise that may
@@ -205,7 +204,6 @@ class SparsePRT(mi.SamplingIntegrator):
         lamps, by_paths = UnitLamps(surfaces), self._settings["method"] == "brute_force"
         settings = {name: self._settings[name] for name in ("max_depth", "spp", "seed", "target_error")}
         settings["method"] = "brute_force" if by_paths else "auto"
-        settings["spp"] = settings["spp"] or LAMP_SPP
         transport = cached_precompute(surfaces, lamps, self._cache, self._progress, **settings)
         found = transport.irradiance_by_depth(lamps.brightness)
         apart = bool(transport.operators["indirect"].by_depth)

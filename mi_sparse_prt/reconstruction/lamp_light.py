@@ -22,6 +22,10 @@ from mi_sparse_prt.solvers.surface_nodes import Nodes
 SHARED = 1.5  # times as many paths are traced as elements have at least (``shared_out``)
 SPLITS = (0.0, 0.5, 1.0)  # of what is traced, what may be photons
 LEAST = 1e-30  # variance, where there is no light
+FIRST = 1 << 23  # paths that come first, of all elements: seconds
+# first paths of an element that are a result: they also tell what photons and paths count, and of two of each, what
+# happens to be small would count most (an office was 6% too dark)
+ENOUGH = 8
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -59,7 +63,9 @@ class LampLight:
     ) -> None:
         n, m = len(ids), problem.emission.size
         self._shape, self._spp, self._levels = (n, m, 3 * apart), spp, levels
-        self._paths = LightByPaths(problem, np.repeat(ids, m), np.tile(np.arange(m), n), spp, seed, apart)
+        self._few = 0 if spp < PILOT else max(2, min(spp // PILOT, FIRST // max(n * m, 1)))
+        elements = np.repeat(ids, m), np.tile(np.arange(m), n)
+        self._paths = LightByPaths(problem, *elements, spp, seed, apart, self._few)
         self._power = np.square(problem.reflection.albedo[ids].astype(np.float64)).mean(axis=1)
         self._photons: LightTracing | None = None
         self._split = np.zeros(m)  # by lamp, what of it are photons
@@ -85,7 +91,7 @@ class LampLight:
     @property
     def _seen(self) -> tuple[int, int]:
         """First paths of each element, and first photons of each lamp."""
-        return self._spp // PILOT, self._spp // PILOT * self._shape[0]
+        return self._few, self._few * self._shape[0]
 
     def _first_photons(self, emitted: NDArray[np.int64]) -> Estimate:
         """Of lamps that send out none, as of nodes without a surface of their own, infinite variance."""
@@ -135,10 +141,9 @@ class LampLight:
         least, few = np.full(self._shape[1], self._spp), self._seen[0]
         for lamp in range(len(least)):
             enough = target**2 * float(self._power @ whole[:, lamp])
-            noise = {0: self._variance(lamp, few, self._first_split(lamp))}
-            noise |= {
-                k: self._variance(lamp, SHARED * k, self._split[lamp]) for k in (few // 2, few, 2 * few)
-            }
+            noise = {0: self._variance(lamp, few, self._first_split(lamp))} if few >= ENOUGH else {}
+            steps = 2 ** np.arange(int(np.log2(self._spp)))
+            noise |= {int(k): self._variance(lamp, SHARED * k, self._split[lamp]) for k in steps}
             met = [k for k, own in noise.items() if 0 < self._power @ (own * left[:, lamp]) <= enough]
             least[lamp] = min(met, default=self._spp)
         return least

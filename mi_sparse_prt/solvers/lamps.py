@@ -262,6 +262,8 @@ class LightByPaths:
     seed : int
     apart : int
         As of ``LampPaths``: estimates are (m, 3 * apart).
+    few : int, optional
+        The first paths of an element, in place of a quarter of ``spp``.
 
     Attributes
     ----------
@@ -277,17 +279,19 @@ class LightByPaths:
         spp: int,
         seed: int,
         apart: int = 1,
+        few: int | None = None,
     ) -> None:
         self._problem, self._asked, self._spp, self._apart = problem, (point_ids, columns), spp, apart
+        self._few = spp // PILOT if few is None else few
         self._pilot, self._main = element_seeds(random_stream(seed, SHARED_OUT), 2)
         self.traced = 0
 
     @cached_property
     def first(self) -> Estimate | None:
-        """By ``spp // PILOT`` paths of all elements; None where those would be too few to tell anything."""
-        if self._spp < PILOT**2:
+        """By few paths of all elements; None where one alone would not tell how far they spread."""
+        if self._few < 2:
             return None
-        paths = LampPaths(self._problem, self._spp // PILOT, self._pilot, self._apart)
+        paths = LampPaths(self._problem, self._few, self._pilot, self._apart)
         self.traced += len(self._asked[0]) * paths.spp
         return paths.elements(*self._asked)
 
@@ -324,7 +328,7 @@ class LightByPaths:
 
     def _shared_out(self, first: Estimate, least: NDArray[np.int64]) -> NDArray[np.int64]:
         """Paths of each element (m,), none where none are asked for."""
-        counts, more, seen = least.copy(), np.flatnonzero(least), self._spp // PILOT
+        counts, more, seen = least.copy(), np.flatnonzero(least), self._few
         if len(more):
             albedo = np.tile(self._problem.reflection.albedo[self._asked[0][more]], self._apart)
             spread = seen * (np.square(albedo.astype(np.float64)) * first.variance[more]).sum(axis=1)
