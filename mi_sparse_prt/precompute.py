@@ -390,7 +390,7 @@ def _lit_by_lamps(problem: Problem, settings: Settings, run: Run) -> LightTransp
         _account(parts, problem, [])
         | {"estimated_error": error.report()}
         | _costs(transport, run.clock)
-        | _inputs(problem, replace(settings, spp=parts.spp))
+        | _inputs(problem, replace(settings, spp=parts.spp or settings.spp))
     )
     return transport
 

@@ -34,7 +34,9 @@ SPP = 64  # paths of an element, where nothing else says how many: what is left 
 # in all, where SPP of each would be more: half a minute. Noise of many lamps averages out in pictures
 PATHS = 1 << 25
 LEAST = 4  # paths of an element, however many these are
-SHARED = "paths of lamps: {} of an element, not {}, as there are {:.0f} million elements; ask for more by spp"
+LIMITED = (
+    "paths of lamps: {} of an element, not {}, as there are {:.0f} million elements; ask for more by spp"
+)
 
 
 def gathered_lamps(
@@ -97,7 +99,7 @@ def path_traced_lamps(
     elements, skipped = len(places.ids) * m, []
     if spp is None:
         spp = max(LEAST, min(SPP, PATHS // max(elements, 1)))
-        skipped = [] if spp == SPP else [SHARED.format(spp, SPP, elements / 1e6)]
+        skipped = [] if spp == SPP else [LIMITED.format(spp, SPP, elements / 1e6)]
     with run.clock.phase("indirect"):
         light = LampLight(problem, places.ids, places.nodes, places.levels, spp, run.seed, max(apart, 1))
         # a quarter of the squared error: few paths know little of noise, smoothing and interpolation blur

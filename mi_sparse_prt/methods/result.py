@@ -40,7 +40,7 @@ class MethodResult:
     dense : (k,) int64 or None
         Vertices whose rows were sampled themselves, ascending, of methods that make other rows from these.
     spp : int or None
-        Paths of an element, at least, if the method chose how many.
+        Paths of an element, at least, where paths of lamps are traced.
     """
 
     direct: Operator | None
