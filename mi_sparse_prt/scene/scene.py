@@ -192,8 +192,8 @@ class Scene:
         Parameters
         ----------
         scene : mi.Scene
-            Meshes; spheres, disks, cylinders, curves and ellipsoids, which become triangles; instances, which become
-            one mesh for each BSDF of their groups. Its sensors, emitters and integrator are reused, not copied.
+            Meshes; spheres, disks, cylinders, curves, ellipsoids and distance grids, which become triangles; instances,
+            which become one mesh for each BSDF of their groups. Its sensors, emitters and integrator are reused.
         edge_length : float, optional
             World units. Longer edges are bisected and curved shapes tessellated to it. Default: the diagonal of
             the scene's box / 64, and shorter near small things and on them (``sizing_field``). `float("inf")` leaves
@@ -202,8 +202,8 @@ class Scene:
         Raises
         ------
         PrtError
-            No mesh; a shape that cannot become triangles (`sdfgrid`); positions or normals that are not finite; an
-            albedo outside [0, 1]; more than 5 million vertices.
+            No mesh; a shape that cannot become triangles (of a plugin that is not Mitsuba's own); positions or normals
+            that are not finite; an albedo outside [0, 1]; more than 5 million vertices.
         """
         result = cls._build(scene, edge_length)
         result._warn()

@@ -30,6 +30,7 @@ from mi_sparse_prt.scene.mesh_cleaning import (
 from mi_sparse_prt.scene.mitsuba_meshes import read_mesh
 from mi_sparse_prt.scene.notes import Fact, Notes, about
 from mi_sparse_prt.scene.parametric_shapes import FEWEST, parametric_mesh, projection
+from mi_sparse_prt.scene.sdf_grids import sdf_mesh
 from mi_sparse_prt.scene.sizing_field import Details, refine_near_details
 from mi_sparse_prt.scene.subdivision import Project, as_it_is, subdivide
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh
@@ -38,7 +39,7 @@ ALL_ROUND = 64  # spheres, disks and cylinders of as many segments as one has: 3
 LEAST_AROUND = 12  # of many: seen from the side, they lack 3% of their radius
 
 OFF = 0.01  # entries of a transform times its inverse: axes of three digits are less so
-_BECOME_TRIANGLES = {"Sphere", "Disk", "Cylinder", "BSplineCurve", "LinearCurve", "Ellipsoids"}
+_BECOME_TRIANGLES = {"Sphere", "Disk", "Cylinder", "BSplineCurve", "LinearCurve", "Ellipsoids", "SDFGrid"}
 
 _INSIDE = " {} inside {}: media are left out, light passes as through a vacuum (volpath renders them)"
 _SENSOR, _EMITTER = (
@@ -197,6 +198,8 @@ def _tessellate(
     if shape.class_name() == "Ellipsoids":
         return ellipsoids_mesh(shape, edge_length, where.name, limit)
     kind, to_world = shape.class_name().lower(), _to_world(shape)
+    if kind == "sdfgrid":
+        return sdf_mesh(shape, to_world, edge_length, where.name, limit=limit, fewest=fewest)
     # A mirrored cylinder turns its own flag, and the cross product behind its normals turns it back.
     mirrored = kind == "cylinder" and np.linalg.det(to_world[:3, :3]) < 0
     mesh = parametric_mesh(

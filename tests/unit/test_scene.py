@@ -653,9 +653,12 @@ def test_cameras_and_lamps_in_media_are_named() -> None:
 
 def test_what_cannot_be_used_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surfaces, "clean_mesh", lambda *_: pytest.fail("a mesh was read"))
-    blob = {"type": "sdfgrid", "filename": str(SCENES / "zoo/blob.vol")}
-    original = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, "a": blob, "b": blob})
-    with pytest.raises(PrtError, match=r"^shapes '.', '.' are of type SDFGrid.*replace them by a mesh"):
+    monkeypatch.setattr(
+        surfaces, "_BECOME_TRIANGLES", {"Disk"}
+    )  # as if balls were of a plugin that is not known
+    ball, floor = {"type": "sphere"}, {"type": "rectangle"}
+    original = mi.load_dict({"type": "scene", "floor": floor, "lid": {"type": "disk"}, "a": ball, "b": ball})
+    with pytest.raises(PrtError, match=r"^shapes '.', '.' are of type Sphere.*replace them by a mesh"):
         Scene.from_mitsuba(original, INF)
 
 
@@ -768,10 +771,6 @@ def test_inward_faces_are_warned_about(shape: dict, warns: bool) -> None:
         ('<shape type="teacup"/>', "teacup"),
         ('<shape type="cube"><float name="colour" value="1"/></shape>', "colour"),
         ('<shape type="ply"><string name="filename" value="gone.ply"/></shape>', "gone.ply"),
-        (
-            f'<shape type="sdfgrid" id="blob"><string name="filename" value="{SCENES / "zoo/blob.vol"}"/></shape>',
-            "shape 'blob' is of type SDFGrid, which is not made of triangles: replace it by a mesh",
-        ),
         (
             '<shape type="disk" id="dot"><transform name="to_world"><scale value="0"/></transform></shape>',
             "x.xml",
