@@ -170,7 +170,11 @@ class SurfaceSmoothing:
         return chosen
 
     def averaged(self, light: Floats, chosen: NDArray[np.int8]) -> Floats:
-        """Light (n_v, m, ...) after as many levels as were chosen (n_v, m); no seams where neighbours differ."""
+        """Light (n_v, m, ...) after as many levels as were chosen (n_v, m); no seams where neighbours differ.
+
+        Peaks are smoothed little and what is around them much: what they lose and it gains are not the same. What is
+        taken from light in wide neighbourhoods, which is no noise, is given back ("twicing", Tukey 1977).
+        """
         own = (*chosen.shape, *(1,) * (light.ndim - chosen.ndim))
 
         def share(number: int) -> Floats:
@@ -179,7 +183,8 @@ class SurfaceSmoothing:
         result = share(0) * light
         for number, smooth in self._after(light.reshape(len(light), -1)):
             result += share(number) * smooth.reshape(light.shape)
-        return result
+        *_, (_, lost) = self._after((light - result).reshape(len(light), -1))
+        return result + lost.reshape(light.shape)
 
     def _after(self, light: Floats) -> Iterator[tuple[int, Floats]]:
         """Light (n_v, k) after 1, 2, ... levels."""
@@ -218,6 +223,7 @@ def noise_left(light: Floats, variance: Floats, levels: list[scipy.sparse.csr_ar
     kept = np.zeros(chosen.shape, np.float32)
     for number, own in enumerate(smoothing.own):
         kept += smoothing.pooled((chosen == number).astype(np.float32)) * np.maximum(own, 0)[:, None]
+    kept += np.maximum(smoothing.own[-1], 0)[:, None] * (1 - kept)  # with what is given back
     return kept[..., None] * noise
 
 
