@@ -372,3 +372,10 @@ def artefact(request: pytest.FixtureRequest):
         figure.savefig(ARTEFACTS / f"{name}{suffix}.png", dpi=60, bbox_inches="tight")
 
     return save
+
+
+@pytest.fixture(scope="module")
+def never_held_out() -> Iterator[None]:
+    """``without_held_out``, for a file."""
+    with without_held_out():
+        yield

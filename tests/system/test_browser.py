@@ -414,7 +414,10 @@ def test_inverse_is_the_inverse(page):
     assert_allclose(found, array(page, "texels"), atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["non_incremental", "incremental", "per_band"])
+@pytest.mark.parametrize(
+    "method",
+    ["per_band", *(pytest.param(m, marks=pytest.mark.slow) for m in ("non_incremental", "incremental"))],
+)
 def test_choices_and_sums_are_those_of_python(page, exported, method):
     made = exported[2]
     bands = wavelet_bands(LIGHTING.resolution, made.clusters.norms())

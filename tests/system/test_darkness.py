@@ -47,7 +47,9 @@ def test_an_unoccluded_row():
 
 
 @pytest.mark.filterwarnings("ignore:.*faces point inwards")
-@pytest.mark.parametrize("method", ["auto", "sparse", pytest.param("brute_force", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["auto", *(pytest.param(m, marks=pytest.mark.slow) for m in ("sparse", "brute_force"))]
+)
 def test_a_closed_room_is_not_refined(method):
     """Rationale: a target error is relative, and nothing is met of nothing.
     Expected: one attempt, dark rows, no warning of a missed target, and the report says why.

@@ -164,7 +164,8 @@ def test_the_error_of_brute_force(coloured):
     assert more.report["estimated_error"]["total"] == pytest.approx(true["total"] / 4, rel=0.25)
 
 
-@pytest.mark.parametrize("max_depth", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow  # rows of terms in the texel basis: tests/unit/test_glossy_horizon.py; their error: above
+@pytest.mark.parametrize("max_depth", [2, 5])
 def test_texels(max_depth):
     """Rationale: in the texel basis a term has the visible share of a texel times the mean of f_k in a disc around it,
     which at 6 x 4 x 4 texels is 4% off, 9% in the second term. The truth has rays in 8 x 8 strata of each texel.

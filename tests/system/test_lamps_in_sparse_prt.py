@@ -223,6 +223,7 @@ def test_lamps_and_what_they_light_in_mirrors_and_glass(folder, artefact):
     assert distance < 0.03
 
 
+@pytest.mark.slow  # by mirror and glass, seen too: above
 def test_light_of_a_lamp_that_a_mirror_throws_on_a_wall(folder, artefact):
     """Rationale: rays of the BSDF meet area lamps by way of mirrors, and no other rays do.
 

@@ -95,7 +95,7 @@ def error(ours: list[np.ndarray], theirs: list[np.ndarray]) -> float:
     return float(np.sqrt(max(beyond, 0)) / size)
 
 
-@pytest.mark.parametrize("hide", [False, True])
+@pytest.mark.parametrize("hide", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize(
     "light", ["panel", *(pytest.param(light, marks=pytest.mark.slow) for light in ("sky", "both"))]
 )

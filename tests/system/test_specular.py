@@ -210,7 +210,9 @@ def test_where_nothing_is_lost_on_the_way_nothing_is_sampled():
     )
 
 
-@pytest.mark.parametrize(("resolution", "depth"), [(1, 5), (4, 5), (4, -1)])
+@pytest.mark.parametrize(
+    ("resolution", "depth"), [(1, 5), pytest.param(4, 5, marks=pytest.mark.slow), (4, -1)]
+)
 def test_bits_and_what_passes_are_told_by_the_same_rays(resolution, depth):
     """As rays for each alone tell them; also where rows are no whole words, and without a depth."""
     scene, lighting = build(0.5, **objects(0.6)), prt.CubemapLighting(resolution)

@@ -162,12 +162,12 @@ def test_strata_that_a_pilot_chooses():
     """
     scene = under_slats(0.6, 0.5)
     direct = DirectSolver(problem_at(scene, LIGHTING, basis="texel"))
-    x, y = (rows(direct.problem, 16, seed) for seed in (101, 102))
-    held = PilotElements(direct.problem, False, 0, 768, 32)
+    x, y = (rows(direct.problem, 10, seed) for seed in (101, 102))
+    held = PilotElements(direct.problem, False, 0, 384, 24)
     costs = [adaptive_cost(direct, held, aim, 0) for aim in (0.5, 0.012, 1e-6)]
     assert costs[0].strata == Strata(1, ACROSS[0]) and costs[-1].strata == Strata(2, ACROSS[-1])
     assert costs[0].error > costs[1].error >= costs[2].error
-    for cost in costs:
+    for cost in costs[:2]:  # the most strata of all take seconds
         assert cost.strata is not None
         plan = Plan("adaptive", strata=cost.strata)
         found = prt.precompute(scene, LIGHTING, plan, "texel", max_depth=2, progress=False)

@@ -16,6 +16,8 @@ from mi_sparse_prt.relighting.viewer.question import page_sensor
 from mi_sparse_prt.scene.mitsuba_meshes import lit_scene
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
+pytestmark = pytest.mark.usefixtures("never_held_out")
+
 LIGHTING = prt.CubemapLighting(4)
 RNG = np.random.default_rng(1)
 LIGHTS = {

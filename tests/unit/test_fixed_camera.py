@@ -9,6 +9,8 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.relighting.film import film_images
 from mi_sparse_prt.relighting.fixed_camera import _collected
 
+pytestmark = pytest.mark.usefixtures("never_held_out")
+
 LIGHTING = prt.CubemapLighting(4)
 ENVIRONMENT = prt.Environment(np.random.default_rng(3).random((8, 16, 3), np.float32) ** 3)
 ROUGH = {"type": "roughconductor", "alpha": 0.4, "material": "Cu"}

@@ -128,7 +128,7 @@ def before_a_mirror(*around: dict, edge_length: float = 0.15) -> Scene:
     return build(edge_length, optimize=False, floor=white, mirror=mirror, **floors)
 
 
-@pytest.mark.parametrize("albedo", [0.004, 0.0])
+@pytest.mark.parametrize("albedo", [0.004, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_rays_towards_mirrors_start_where_their_light_is_seen(albedo):
     """
     Scenario: a white floor before a mirror, alone and on a wide dark one; noise of 1% is asked for.

@@ -33,7 +33,7 @@ def hall(through: float, covered: bool, **more: dict) -> Scene:
 
 
 @pytest.mark.parametrize("covered", [False, True], ids=["bare", "mask"])
-@pytest.mark.parametrize(("through", "off"), [(2.0, 0.01), (1.2, 0.05)])
+@pytest.mark.parametrize(("through", "off"), [(2.0, 0.01), pytest.param(1.2, 0.05, marks=pytest.mark.slow)])
 def test_a_curtain_lights_the_wall_behind_it(through, off, covered):
     """Expected: indirect light of the wall is that of paths, within 1% if all goes through, and 5% if some does not.
 

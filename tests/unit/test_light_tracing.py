@@ -104,7 +104,7 @@ def flux_by_paths(
     return means.mean(axis=0) * areas.sum(), means.std(axis=0) / np.sqrt(points) * areas.sum()
 
 
-@pytest.mark.parametrize("shaded", [False, True], ids=["bare", "shade"])
+@pytest.mark.parametrize("shaded", [pytest.param(False, marks=pytest.mark.slow), True], ids=["bare", "shade"])
 def test_photons_bring_what_paths_find(shaded):
     """Rationale: all that arrives at a mesh, by how many surfaces it met, from plastic, metal, glass, a veil, a shade.
 

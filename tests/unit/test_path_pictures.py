@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 import mi_sparse_prt as prt
 from mi_sparse_prt.relighting.viewer import make_live_page
 
+pytestmark = pytest.mark.usefixtures("never_held_out")
+
 LIGHTING = prt.CubemapLighting(4)
 LIGHTS = {name: prt.Environment(np.random.default_rng(k).random((8, 16, 3))) for k, name in enumerate("ab")}
 VIEW = {"eye": [1.2, 1.9, 3.2], "target": [0, 0.5, 0], "up": [0, 1, 0], "height": 0.8}
@@ -55,7 +57,7 @@ def picture(answers, asked, content=b""):
     return np.frombuffer(found, "<f2").reshape(asked["rows"], asked["columns"], 3).astype(np.float32)
 
 
-@pytest.mark.parametrize("light", ["cubemap", "lamps"])
+@pytest.mark.parametrize("light", [pytest.param("cubemap", marks=pytest.mark.slow), "lamps"])
 def test_the_process_renders_what_this_one_would(file, light):
     """Rationale: it has a scene, an environment or lamps, a camera and a depth of its own, from what it is sent.
 

@@ -58,8 +58,11 @@ def test_what_is_no_sample_weighs_nothing():
     np.testing.assert_array_equal(weight.numpy()[0], np.float32([0.5, 0, 0, 0, NAN]))
 
 
+@pytest.mark.usefixtures("never_held_out")
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("light", [("sky",), ("lamp", "sky")], ids=["sky", "lamp"])
+@pytest.mark.parametrize(
+    "light", [pytest.param(("sky",), marks=pytest.mark.slow), ("lamp", "sky")], ids=["sky", "lamp"]
+)
 def test_pictures_are_finite(light, tmp_path):
     """Expected: followed gold has no infinite pixels, and loses no more than these samples find."""
     mi.register_bsdf("slipping", Slipping)

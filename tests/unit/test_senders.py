@@ -137,7 +137,7 @@ def test_rows_of_the_matrix_among_those_that_are_sent():
 
 
 @pytest.mark.usefixtures("no_held_out")
-@pytest.mark.parametrize("share", [1.0, 0.25])
+@pytest.mark.parametrize("share", [pytest.param(1.0, marks=pytest.mark.slow), 0.25])
 def test_what_metals_send_is_that_of_paths(monkeypatch, share):
     """
     Rationale: a low sun meets the metal floor and ball, of which walls see the reflections; terms of all metal
@@ -235,7 +235,7 @@ def test_terms_of_flat_surfaces_do_not_depend_on_tangents(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_held_out")
-@pytest.mark.parametrize("max_depth", [-1, 4])
+@pytest.mark.parametrize("max_depth", [-1, pytest.param(4, marks=pytest.mark.slow)])
 def test_terms_between_senders(monkeypatch, max_depth):
     """
     Rationale: a rough plastic ball above a coloured floor, whose tangents go around its poles.

@@ -14,6 +14,8 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.radiosity import RadiositySolver
 
+pytestmark = pytest.mark.usefixtures("never_held_out")
+
 RED, BLUE = diffuse(0.8, 0.2, 0.1), diffuse(0.1, 0.2, 0.9)
 GROUND = {
     "type": "rectangle",

@@ -90,7 +90,7 @@ def test_vertices_lie_on_round_shapes():
 def test_vertices_are_limited(monkeypatch):
     """Expected: of very many small things, edges are shorter only as far as vertices suffice; all have the same."""
     rng = np.random.default_rng(0)
-    boxes = [box(float(x), 0.3) for x in rng.uniform(-90, 90, 300)]
+    boxes = [box(float(x), 0.3) for x in rng.uniform(-90, 90, 100)]
     monkeypatch.setattr(sizing_field, "LEAST", 0)
     monkeypatch.setattr(sizing_field, "SHARE", 0.0)
     few = scene(100, *boxes).n_vertices

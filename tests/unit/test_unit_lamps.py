@@ -141,7 +141,7 @@ def test_what_takes_no_colour_is_refused_by_name():
         UnitLamps(prt.Scene.from_mitsuba(mi.load_dict({"type": "scene", "a": {"type": "sphere"}}), 1))
 
 
-@pytest.mark.parametrize("metal", [False, True])
+@pytest.mark.parametrize("metal", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_pictures_ask_for_what_surfaces_reflect(metal: bool) -> None:
     """
     Rationale: pictures sample the lamps themselves; their direct light, and its check, would be for nothing.
