@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from mi_sparse_prt.core.errors import PrtError
-from mi_sparse_prt.scene.mesh_cleaning import drop_degenerate
+from mi_sparse_prt.scene.mesh_cleaning import drop_degenerate, drop_unreferenced
 from mi_sparse_prt.scene.subdivision import too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals
 
@@ -61,7 +61,7 @@ def sdf_mesh(
     mesh = TriangleMesh(name, positions, normals, triangles.astype(np.int32), texcoords)
     against = np.sum(triangle_normals(mesh) * normals[mesh.triangles].sum(axis=1), axis=1) < 0
     mesh.triangles[against] = mesh.triangles[against][:, [0, 2, 1]]
-    return drop_degenerate(mesh)[0]
+    return drop_unreferenced(drop_degenerate(mesh)[0])[0]
 
 
 def _shading_normals(
