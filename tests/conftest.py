@@ -298,6 +298,13 @@ def no_held_out() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def never_held_out() -> Iterator[None]:
+    """``without_held_out``, for a file."""
+    with without_held_out():
+        yield
+
+
 @pytest.fixture
 def usual_factors(monkeypatch: pytest.MonkeyPatch) -> None:
     """BRDF factors at as many directions as users have: 16 times the work, of some seconds for each BSDF."""
@@ -372,10 +379,3 @@ def artefact(request: pytest.FixtureRequest):
         figure.savefig(ARTEFACTS / f"{name}{suffix}.png", dpi=60, bbox_inches="tight")
 
     return save
-
-
-@pytest.fixture(scope="module")
-def never_held_out() -> Iterator[None]:
-    """``without_held_out``, for a file."""
-    with without_held_out():
-        yield

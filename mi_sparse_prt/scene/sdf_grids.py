@@ -10,6 +10,7 @@ from scipy.ndimage import zoom
 
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.scene.mesh_cleaning import drop_degenerate, drop_unreferenced
+from mi_sparse_prt.scene.mitsuba_meshes import scene_of
 from mi_sparse_prt.scene.subdivision import too_many_vertices
 from mi_sparse_prt.scene.triangle_mesh import TriangleMesh, normalise_rows, triangle_normals
 
@@ -49,7 +50,7 @@ def sdf_mesh(
         )
     sizes = np.linalg.norm(to_world[:3, :3], axis=0)
     finer = np.ceil(np.maximum(sizes / edge_length, fewest * sizes / sizes.max()) / cells).clip(1)
-    if np.sum(finer * cells) ** 2 > limit:
+    if np.sum(finer * cells) ** 2 > limit:  # more than six sides of the grid have
         raise too_many_vertices(name, edge_length, limit)
     fine = zoom(distances, (finer * cells + 1) / (cells + 1), order=1)
     local, triangles, downhill, _ = marching_cubes(fine, 0.0, gradient_direction="ascent")
@@ -71,7 +72,7 @@ def _shading_normals(
 
     A thousandth of a cell beside the vertices, which lie on the sides of cells, where rays can slip through.
     """
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    scene = scene_of({"shape": shape})
     beside = mi.Point3f(positions.T) + 1e-3 * cell * mi.Vector3f(0.8, 0.5, 0.3)
     direction = mi.Vector3f(-outwards.T.astype(np.float32))
     si = scene.ray_intersect(mi.Ray3f(beside - 0.5 * cell * direction, direction))

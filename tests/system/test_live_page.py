@@ -246,7 +246,7 @@ def test_a_click_shows_a_row(driver, scene, served):
     assert f"({mesh})" in words
 
 
-@pytest.mark.slow  # dropped on a page without Python: tests/system/test_browser.py
+@pytest.mark.slow  # Python's part of it: tests/unit/test_answers.py; the page's: tests/system/test_browser.py
 @pytest.mark.parametrize("served", ["clusters"], indirect=True)
 def test_dropped_images_are_checked_in_python(driver, served, tmp_path):
     light = sky(5)
@@ -289,7 +289,6 @@ def test_errors_of_meshes_are_colours(driver, scene, served):
     assert {name: entry["error"] for name, entry in errors.items()} == pytest.approx(told)
 
 
-@pytest.mark.slow  # of one browser: above; of questions that come and go: tests/unit/test_answers.py
 def test_two_browsers_and_one_that_comes_back(driver, scene, transports):
     """Both get their own answers; a page whose server is gone says so, and goes on when there is one again."""
     page = Served(scene, transports["glossy"], LIGHTS)

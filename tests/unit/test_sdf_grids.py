@@ -48,10 +48,9 @@ def test_triangles_are_where_rays_meet_the_grid(centre: Sequence[float], radius:
     shape = grid_of(centre, radius, to_world=STRETCHED)
     mesh = triangles_of(shape, 0.05)
     random = np.random.default_rng(1)
-    origin = np.array([[2.0], [2.5], [3.75]]) + 4 * (d := random.normal(size=(3, 20_000))) / np.linalg.norm(
-        d, axis=0
-    )
-    towards = np.array([[2.0], [2.5], [3.75]]) + random.uniform(-0.7, 0.7, (3, 20_000)) - origin
+    middle, around = np.array([[2.0], [2.5], [3.75]]), random.normal(size=(3, 20_000))
+    origin = middle + 4 * around / np.linalg.norm(around, axis=0)
+    towards = middle + random.uniform(-0.7, 0.7, (3, 20_000)) - origin
     towards /= np.linalg.norm(towards, axis=0)
     rays = mi.Ray3f(mi.Point3f(origin.astype(np.float32)), mi.Vector3f(towards.astype(np.float32)))
     met, t, n, sh_n = first_hits(shape, rays)
@@ -113,6 +112,14 @@ def test_instances_of_a_grid_are_copied() -> None:
     }
     scene = Scene.from_mitsuba(mi.load_dict({"type": "scene", "g": group, **places}))
     assert np.ptp(scene.positions, axis=0) == pytest.approx([2.6, 0.6, 0.6], abs=0.005)
+
+
+def test_the_shape_keeps_its_name() -> None:
+    """Rationale: Mitsuba names shapes anew in each scene that they are put into."""
+    scene = mi.load_dict({"type": "scene", "blob": grid_of((0.5,) * 3, 0.3)}, optimize=False)
+    for _ in range(2):
+        assert [mesh.name for mesh in Scene.from_mitsuba(scene).meshes] == ["blob"]
+    assert [shape.id() for shape in scene.shapes()] == ["blob"]
 
 
 def test_too_fine_cells_are_refused() -> None:
