@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.cli import options
-from mi_sparse_prt.cli.running import running
+from mi_sparse_prt.cli.running import Command, running
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import mitsuba as mi
     import numpy as np
     from numpy.typing import NDArray
+
+
+FILM = ".mp4"
 
 
 class ManyLightsMethod(StrEnum):
@@ -30,7 +38,7 @@ Output = Annotated[
         "--output",
         "-o",
         metavar="FILE",
-        help="Image to write: .exr (linear) or .png (sRGB).",
+        help="Image to write: .exr (linear) or .png (sRGB). With --frames: a film (.mp4), or a folder for .png files.",
         show_default=False,
     ),
 ]
@@ -91,7 +99,38 @@ Preview = Annotated[
         "--preview", help="Write the image early, from a ninth of the columns, and again in the end."
     ),
 ]
-Exposure = Annotated[float, typer.Option(help="Stops by which .png files are brightened.")]
+Exposure = Annotated[float, typer.Option(help="Stops by which .png files, or all of a film, are brightened.")]
+FrameCount = Annotated[
+    int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
+]
+Animate = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=FROM:TO",
+        help="What moves in a film: a <default> of the scene, from one number to another, evenly. Repeatable.",
+        show_default=False,
+    ),
+]
+FrameRate = Annotated[float, typer.Option("--fps", help="Frames of a film per second.")]
+
+
+@dataclass(frozen=True)
+class _Film:
+    """A film that is asked for: frames of a scene whose parameters change."""
+
+    output: Path
+    frames: int
+    fps: float
+    ranges: dict[str, tuple[float, float]]
+
+    @property
+    def is_folder(self) -> bool:
+        return self.output.suffix.lower() != FILM
+
+    def parameters(self, frame: int) -> dict[str, str]:
+        """Of a frame, as ``load_scene`` takes them."""
+        share = frame / max(self.frames - 1, 1)
+        return {name: repr(first + share * (last - first)) for name, (first, last) in self.ranges.items()}
 
 
 def many_lights(
@@ -111,6 +150,9 @@ def many_lights(
     seed: Seed = 0,
     groups: Groups = False,
     preview: Preview = False,
+    frames: FrameCount = None,
+    animate: Animate = None,
+    fps: FrameRate = 30.0,
     exposure: Exposure = 0.0,
     define: options.Define = None,
     variant: options.Variant = None,
@@ -123,45 +165,136 @@ def many_lights(
 
     A forecast comes first, its own estimate of its error last. In place of --rows and --columns:
     --seconds 10 for all that fits into them, --error 0.02 for as much as it takes.
+
+    A film: mi-sparse-prt many-lights scenes_xml/many_lights/room.xml -o room.mp4 --frames 48 --animate slide=0:1
     """
+    settings = {
+        "method": method.value,
+        "lights": lights,
+        "spp": spp,
+        "max_depth": max_depth,
+        "clamp": clamp,
+        "seed": seed,
+        "groups": groups,
+        "compensate": compensate,
+    }
+    given, parameters = (scene, rows, columns, camera), options.definitions(define)
+    if frames is not None or animate:
+        film = _asked_film(output, frames, animate, fps)
+        if groups or preview or seconds is not None or error is not None:
+            raise typer.BadParameter(
+                "a film has --rows and --columns, and no --groups, --preview, --seconds or --error"
+            )
+        with running(json_file, quiet, outputs=[None if film.is_folder else output]) as command:
+            _render_film(command, film, given, parameters, settings, (exposure, quiet))
+        return
     _check_output(output, groups)
     with running(json_file, quiet, outputs=[output]) as command:
-        from mi_sparse_prt.cli.files import image_bytes
-        from mi_sparse_prt.cli.tables.many_lights import many_lights_table
-        from mi_sparse_prt.io.exr_layers import layers_bytes
-        from mi_sparse_prt.scene.loading import load_mitsuba
-        from mi_sparse_prt.scene.unfolding import unfold_instances
+        budget = {"seconds": seconds, "error": error}
+        _render(command, output, given, parameters, settings | budget, (exposure, preview, quiet))
 
-        def write(image: NDArray[np.float32]) -> None:
-            command.write(output, image_bytes(image, output.suffix.lower(), exposure))
 
-        loaded = unfold_instances(load_mitsuba(scene, **options.definitions(define)))
-        # an early picture is written while the work goes on, and must not be cut off
-        with command.patient_interrupts() if preview else command.prompt_interrupts():
-            found = prt.render_many_lights(
-                loaded,
-                rows,
-                columns,
-                seconds,
-                sensor=camera,
-                progress=not quiet,
-                preview=write if preview else None,
-                method=method.value,
-                lights=lights,
-                spp=spp,
-                max_depth=max_depth,
-                clamp=clamp,
-                seed=seed,
-                groups=groups,
-                compensate=compensate,
-                error=error,
-            )
-        if groups:
-            command.write(output, layers_bytes(found.image, found.layers))
-        else:
-            write(found.image)
-        command.report = {"scene": str(scene), "image": str(output), **found.report}
-        command.show(many_lights_table(str(scene), found.report))
+def _render(
+    command: Command,
+    output: Path,
+    given: tuple[Path, int, int, int],
+    parameters: dict[str, str],
+    settings: dict[str, Any],
+    how: tuple[float, bool, bool],
+) -> None:
+    """One picture. ``given`` are the scene, rows, columns and camera, ``how`` exposure, preview and quiet."""
+    from mi_sparse_prt.cli.files import image_bytes
+    from mi_sparse_prt.cli.tables.many_lights import many_lights_table
+    from mi_sparse_prt.io.exr_layers import layers_bytes
+    from mi_sparse_prt.scene.loading import load_mitsuba
+    from mi_sparse_prt.scene.unfolding import unfold_instances
+
+    (scene, rows, columns, camera), (exposure, preview, quiet) = given, how
+
+    def write(image: NDArray[np.float32]) -> None:
+        command.write(output, image_bytes(image, output.suffix.lower(), exposure))
+
+    loaded = unfold_instances(load_mitsuba(scene, **parameters))
+    # an early picture is written while the work goes on, and must not be cut off
+    with command.patient_interrupts() if preview else command.prompt_interrupts():
+        found = prt.render_many_lights(
+            loaded,
+            rows,
+            columns,
+            sensor=camera,
+            progress=not quiet,
+            preview=write if preview else None,
+            **settings,
+        )
+    if settings["groups"]:
+        command.write(output, layers_bytes(found.image, found.layers))
+    else:
+        write(found.image)
+    command.report = {"scene": str(scene), "image": str(output), **found.report}
+    command.show(many_lights_table(str(scene), found.report))
+
+
+def _render_film(
+    command: Command,
+    film: _Film,
+    given: tuple[Path, int, int, int],
+    parameters: dict[str, str],
+    settings: dict[str, Any],
+    how: tuple[float, bool],
+) -> None:
+    """All frames, see ``_render``; ``how`` is exposure and quiet."""
+    from mi_sparse_prt.cli.film import check_frame_folder, make_film, new_frames
+    from mi_sparse_prt.cli.tables.many_lights import film_table
+    from mi_sparse_prt.scene.loading import load_mitsuba
+    from mi_sparse_prt.scene.unfolding import unfold_instances
+
+    (scene, rows, columns, camera), (exposure, quiet) = given, how
+    if film.is_folder:
+        check_frame_folder(film.output, film.frames)
+
+    def at(frame: int) -> mi.Scene:
+        return unfold_instances(load_mitsuba(scene, **parameters | film.parameters(frame)))
+
+    start, reports = time.perf_counter(), list[dict[str, Any]]()
+    found = prt.render_many_lights_frames(at, [camera] * film.frames, rows, columns, **settings)
+
+    def images() -> Iterator[NDArray[np.float32]]:
+        for frame in found:
+            reports.append(frame.report)
+            yield frame.image
+
+    into = new_frames(command, film.output, film.frames, film.fps, exposure, film.is_folder)
+    size = make_film(command, into, images(), film.frames, not quiet)
+    command.report = {
+        "scene": str(scene),
+        "film": {"path": str(film.output), "frames": film.frames, "bytes": size, "fps": film.fps},
+        "animate": film.ranges,
+        "seconds": time.perf_counter() - start,
+        "frames": reports,
+    }
+    command.show(film_table(command.report))
+
+
+def _asked_film(output: Path, frames: int | None, animate: list[str] | None, fps: float) -> _Film:
+    """What --frames and --animate say (typer.BadParameter)."""
+    if frames is None or frames < 1:
+        raise typer.BadParameter("give how many frames the film has, 1 or more", param_hint="--frames")
+    if not animate:
+        raise typer.BadParameter("nothing moves: give --animate NAME=FROM:TO", param_hint="--frames")
+    if not 0 < fps < float("inf"):
+        raise typer.BadParameter(f"{fps} is not above 0", param_hint="--fps")
+    if output.suffix.lower() not in ("", FILM):
+        raise typer.BadParameter(f"{output}: give a name that ends in {FILM}, or a folder", param_hint="-o")
+    ranges = {}
+    for name, value in options.definitions(animate, "--animate", "NAME=FROM:TO").items():
+        try:
+            first, last = map(float, value.split(":"))
+        except ValueError:
+            raise typer.BadParameter(
+                f"'{name}={value}' is not NAME=FROM:TO with two numbers", param_hint="--animate"
+            ) from None
+        ranges[name] = first, last
+    return _Film(output, frames, fps, ranges)
 
 
 def _check_output(output: Path, groups: bool) -> None:

@@ -38,7 +38,7 @@ def _start_in_variant(name: str | None) -> str | None:
     return name
 
 
-def definitions(pairs: list[str] | None) -> dict[str, str]:
+def definitions(pairs: list[str] | None, option: str = "-D", form: str = "NAME=VALUE") -> dict[str, str]:
     """NAME=VALUE pairs as ``load_scene`` takes them.
 
     Raises
@@ -50,7 +50,7 @@ def definitions(pairs: list[str] | None) -> dict[str, str]:
     for pair, (name, equals, _) in zip(pairs or [], split, strict=True):
         if not equals or not name.isidentifier() or name in ("path", "edge_length"):
             raise typer.BadParameter(
-                f"{pair!r} is not NAME=VALUE with the NAME of a <default> in the scene", param_hint="-D"
+                f"{pair!r} is not {form} with the NAME of a <default> in the scene", param_hint=option
             )
     return {name: value for name, _, value in split}
 

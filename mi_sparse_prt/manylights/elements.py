@@ -82,6 +82,10 @@ class Elements:
         self.clamp = min(lights.clamp, 1e30)
         self.evaluated = 0
 
+    def with_lights(self, lights: Lights) -> Elements:
+        """The same samples, and other lights."""
+        return Elements(self.scene, self.surfaces, self.samples, lights)
+
     @property
     def shape(self) -> tuple[int, int]:
         """Samples and lights."""

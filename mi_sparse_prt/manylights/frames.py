@@ -1,15 +1,17 @@
-"""Pictures of a camera that moves, which share the lights that stand for all: nothing flickers.
+"""Pictures of a scene that moves, which share the lights that stand for all: nothing flickers.
 
 Of each frame for itself, other lights would represent other clusters, and the error would be another one from frame to
-frame. Here some rows of all frames tell which columns are alike (Hasan, Velazquez-Armendariz, Pellacini, Bala 2008 have
-clusters of frames, too), and each frame is a sum of the same columns.
+frame. Here lights go along with what moves, some rows of all frames tell which columns are alike (Hasan,
+Velazquez-Armendariz, Pellacini, Bala 2008 have clusters of frames, too), and each frame is a sum of the same columns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import reduce
+from itertools import starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -19,10 +21,12 @@ from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.variant import check_variant
-from mi_sparse_prt.manylights.elements import Done, Elements, ReducedColumns
+from mi_sparse_prt.emission.emitters import named_emitters
+from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedColumns
 from mi_sparse_prt.manylights.image import ManyLightsImage
-from mi_sparse_prt.manylights.lights import scene_lights
-from mi_sparse_prt.manylights.render import PROJECTED, RowColumn, Settings, find_view
+from mi_sparse_prt.manylights.light_arrays import DIRECTION
+from mi_sparse_prt.manylights.lights import Lights, count_lights, mean_counts, order_lights, scene_lights
+from mi_sparse_prt.manylights.render import PROJECTED, RowColumn, Settings, View, find_view
 from mi_sparse_prt.manylights.samples import Samples
 from mi_sparse_prt.manylights.surfaces import Surfaces
 from mi_sparse_prt.sampling.row_column import random_projection
@@ -31,19 +35,25 @@ from mi_sparse_prt.scene.scene import Scene
 _PROJECT = 3  # key of random numbers
 
 
+Moving = Callable[[int], mi.Scene | Scene]
+
+
 def render_many_lights_frames(
-    scene: mi.Scene | Scene | str | Path,
+    scene: mi.Scene | Scene | str | Path | Moving,
     sensors: Sequence[int | mi.Sensor],
     rows: int = 300,
     columns: int = 900,
     progress: bool = False,
     **settings: Any,
 ) -> Iterator[ManyLightsImage]:
-    """Render a scene from several cameras by the same point lights, as frames of a film: see ``render_many_lights``.
+    """Render frames of a film by the same point lights, whatever moves: see ``render_many_lights``.
 
     Parameters
     ----------
-    scene : mi.Scene, Scene, str or Path
+    scene : mi.Scene, Scene, str, Path or callable
+        Where lamps, materials or shapes change: a callable that is given the number of a frame, from 0, and returns
+        the scene as it is then. It is called up to three times for each, and may change and return one scene.
+        All frames have the same emitters.
     sensors : sequence of int or mi.Sensor
         One for each frame; frames that see the same surfaces, or rows tell less about each of them.
     rows : int
@@ -58,12 +68,14 @@ def render_many_lights_frames(
     Yields
     ------
     ManyLightsImage
-        Each frame as soon as it is known. Where lights change colour and intensity, take ``groups=True`` and ``mixed``.
+        Each frame as soon as it is known. Where lamps change nothing but colour and intensity, ``groups=True`` and
+        ``mixed`` take milliseconds.
 
     Raises
     ------
     PrtError
-        As ``render_many_lights``; and for ``seconds`` and ``error``, which a frame cannot have for itself.
+        As ``render_many_lights``; for ``seconds`` and ``error``, which a frame cannot have for itself; for a frame
+        that has other emitters than the first.
     """
     check_variant()
     for name in ("seconds", "error"):
@@ -77,52 +89,168 @@ def render_many_lights_frames(
         raise PrtError("there are no sensors: give one for each frame")
     run = Run(asked.seed, progress=progress)
     with run.clock.phase("load"):
-        loaded = find_view(scene, sensors[0])[0]
-        cameras = [find_view(loaded, sensor)[1] for sensor in sensors]
-    return _frames(loaded, cameras, asked, run)
+        shot = _MovingShot(scene, sensors, asked) if callable(scene) else _Shot(scene, sensors, asked)
+    return _frames(shot, run)
 
 
-def _frames(
-    scene: mi.Scene, cameras: list[mi.Sensor], asked: Settings, run: Run
-) -> Iterator[ManyLightsImage]:
-    surfaces = Surfaces(scene)
-    with run.clock.phase("lights"):
-        lights = scene_lights(scene, asked.light_options())
+class _Shot:
+    """Frames of a scene in which nothing but the camera moves."""
 
-    def matrix(camera: mi.Sensor) -> Elements:
+    def __init__(
+        self, scene: mi.Scene | Scene | str | Path, sensors: Sequence[int | mi.Sensor], asked: Settings
+    ) -> None:
+        self.asked = asked
+        self._scene = find_view(scene, sensors[0])[0]
+        self._cameras = [find_view(self._scene, sensor)[1] for sensor in sensors]
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def count_lights(self) -> None:
+        """So that all frames have as many."""
+        self._surfaces = Surfaces(self._scene)
+        self._lights = scene_lights(self._scene, self.asked.light_options())
+
+    def elements(self, frame: int) -> Elements:
+        """The matrix of a frame."""
+        return self._elements(self._scene, self._cameras[frame], self._surfaces, self._lights)
+
+    def _elements(self, scene: mi.Scene, camera: mi.Sensor, surfaces: Surfaces, lights: Lights) -> Elements:
+        asked = self.asked
         samples = Samples(scene, surfaces, camera, asked.spp, asked.max_depth, asked.seed, asked.groups)
         return Elements(scene, surfaces, samples, lights)
 
+
+class _MovingShot(_Shot):
+    """Frames of a scene that changes; none of them is kept."""
+
+    def __init__(self, scene: Moving, sensors: Sequence[int | mi.Sensor], asked: Settings) -> None:
+        self.asked, self._moving, self._sensors = asked, scene, sensors
+        self._names = self._emitters(self._view(0)[0])
+
+    def __len__(self) -> int:
+        return len(self._sensors)
+
+    def count_lights(self) -> None:
+        """By the mean of all frames."""
+        found = []
+        for frame in range(len(self)):
+            scene, _ = self._view(frame)
+            if (names := self._emitters(scene)) != self._names:
+                raise PrtError(
+                    f"frame {frame} has the emitters {', '.join(names) or 'none'}, and frame 0 "
+                    f"{', '.join(self._names) or 'none'}: give all frames the same"
+                )
+            found.append(count_lights(scene, self.asked.light_options()))
+        self._counts = mean_counts(found)
+
+    def elements(self, frame: int) -> Elements:
+        scene, camera = self._view(frame)
+        lights = scene_lights(scene, self.asked.light_options(), self._counts)
+        return self._elements(scene, camera, Surfaces(scene), lights)
+
+    def _view(self, frame: int) -> View:
+        return find_view(self._moving(frame), self._sensors[frame])
+
+    def _emitters(self, scene: mi.Scene) -> list[str]:
+        return sorted(named_emitters(scene, [shape.id() for shape in scene.shapes()]))
+
+
+def _frames(shot: _Shot, run: Run) -> Iterator[ManyLightsImage]:
+    asked = shot.asked
+    with run.clock.phase("lights"):
+        shot.count_lights()
     with run.clock.phase("rows"), run.bar(asked.rows, "rows") as bar:
-        reduced = _reduced_of_all(cameras, matrix, len(lights), asked, bar.update)
-    for k, camera in enumerate(cameras):
-        own = Run(asked.seed, progress=run.progress) if k else run  # the first has what was done for all
+        tracks = _tracks_of_all(shot, bar.update)
+    for frame in range(len(shot)):
+        own = Run(asked.seed, progress=run.progress) if frame else run  # the first has what was done for all
         with own.clock.phase("samples"):
-            elements = matrix(camera)
-        found = RowColumn(elements, asked, own)
+            elements = shot.elements(frame)
+            elements = elements.with_lights(elements.lights.named(tracks.identity, tracks.group))
+        found = RowColumn(elements, asked, own, tracks.flux)
         found.trace_left_out()
-        yield found.picture(found.compensated(found.estimate_from(reduced)))
+        yield found.picture(found.compensated(found.estimate_from(tracks.reduced)))
 
 
-def _reduced_of_all(
-    cameras: list[mi.Sensor],
-    matrix: Callable[[mi.Sensor], Elements],
-    lights: int,
-    asked: Settings,
-    done: Done,
-) -> ReducedColumns:
-    """Reduced columns of rows of all frames, as many of each; no frame is kept."""
+class _Tracks(NamedTuple):
+    """Lights of several frames, ascending by identity until they are put into order.
+
+    Attributes
+    ----------
+    identity, group : (n,) integers
+        See ``Lights``.
+    place : (n, 3) float32
+        Where each was when it was last seen.
+    far : (n,) bool
+        It is a direction.
+    flux : (n,) float64
+        Of all frames.
+    reduced : ReducedColumns
+        Of rows of all frames.
+    """
+
+    identity: NDArray[np.int64]
+    group: NDArray[np.int32]
+    place: Floats
+    far: NDArray[np.bool_]
+    flux: NDArray[np.float64]
+    reduced: ReducedColumns
+
+    def take(self, ids: NDArray[np.int64]) -> _Tracks:
+        """Some of them, in another order."""
+        identity, group, place, far, flux, reduced = self
+        return _Tracks(identity[ids], group[ids], place[ids], far[ids], flux[ids], reduced.of_lights(ids))
+
+    def and_frame(self, later: _Tracks) -> _Tracks:
+        """Those of a frame more."""
+        identity = np.union1d(self.identity, later.identity)
+        before, now = (np.searchsorted(identity, own) for own in (self.identity, later.identity))
+
+        def spread(values: NDArray[Any], places: NDArray[np.int64]) -> NDArray[Any]:
+            whole = np.zeros((len(identity), *values.shape[1:]), values.dtype)
+            whole[places] = values
+            return whole
+
+        def latest(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            whole = spread(old, before)
+            whole[now] = new
+            return whole
+
+        def total(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            return spread(old, before) + spread(new, now)
+
+        projected = total(self.reduced.projected, later.reduced.projected)
+        squares = total(self.reduced.channel_norms**2, later.reduced.channel_norms**2)
+        return _Tracks(
+            identity,
+            latest(self.group, later.group),
+            latest(self.place, later.place),
+            latest(self.far, later.far),
+            total(self.flux, later.flux),
+            ReducedColumns(projected, np.sqrt(squares.sum(axis=1)), np.sqrt(squares)),
+        )
+
+
+def _tracks_of_all(shot: _Shot, done: Done) -> _Tracks:
+    """Lights of all frames, and their columns of rows of all frames, as many of each; no frame is kept."""
+    asked = shot.asked
     projection = random_projection(asked.rows, PROJECTED, asked.random(_PROJECT))
-    projected, squares = np.zeros((lights, projection.shape[1]), np.float32), np.zeros((lights, 3))
-    for k, places in enumerate(_shared_out(asked.rows, len(cameras))):
-        if len(places):
-            elements = matrix(cameras[k])
-            seed = int(random_stream(asked.seed, k).generate_state(1)[0])  # rows of frames differ
-            ids = elements.samples.stratified_rows(len(places), seed)
-            found = elements.reduce_columns(ids, projection[places[: len(ids)]], done)
-            projected += found.projected
-            squares += found.channel_norms**2
-    return ReducedColumns(projected, np.sqrt(squares.sum(axis=1)), np.sqrt(squares))
+
+    def of_frame(frame: int, places: NDArray[np.int64]) -> _Tracks:
+        elements = shot.elements(frame)
+        seed = int(random_stream(asked.seed, frame).generate_state(1)[0])  # rows of frames differ
+        rows = elements.samples.stratified_rows(len(places), seed)
+        return _tracks(elements.lights, elements.reduce_columns(rows, projection[places[: len(rows)]], done))
+
+    found = reduce(_Tracks.and_frame, starmap(of_frame, enumerate(_shared_out(asked.rows, len(shot)))))
+    return found.take(order_lights(found.place, found.far))
+
+
+def _tracks(lights: Lights, reduced: ReducedColumns) -> _Tracks:
+    """Of one frame."""
+    place, far = lights.arrays.place.numpy().T, lights.arrays.kind.numpy() == DIRECTION
+    found = _Tracks(lights.identity, lights.group, place, far, lights.flux, reduced)
+    return found.take(np.argsort(lights.identity))
 
 
 def _shared_out(rows: int, frames: int) -> list[NDArray[np.int64]]:

@@ -40,6 +40,8 @@ PILOT = 1 << 12  # rays that tell how bright emitters are, and particles that te
 _POWER, _DIRECTIONS, _PILOT, _PARTICLES, _AREAS = range(5)  # of random numbers
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Longs = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,9 @@ class Lights:
         See ``LightOptions``.
     radius : float
         Of the scene's bounding sphere.
+    identity : (n,) int64
+        Names each light by the random numbers that made it: with the same seed and ``LightCounts``, a light is where it
+        was before, or near there, when the scene has changed a little.
     """
 
     def __init__(
@@ -105,9 +110,10 @@ class Lights:
         names: Sequence[str],
         clamp: float,
         radius: float,
+        identity: Longs,
     ) -> None:
         self.arrays, self.group, self.names, self.clamp = arrays, group, tuple(names), clamp
-        self.radius = radius
+        self.radius, self.identity = radius, identity
         self.kinds = LightKinds(bool(dr.any(arrays.kind == EMITTER)) if len(group) else False, glossy)
 
     def __len__(self) -> int:
@@ -116,6 +122,16 @@ class Lights:
     def take(self, ids: NDArray[np.integer]) -> LightArrays:
         """Some lights on the device."""
         return self.arrays.take(on_device(mi.UInt32, np.asarray(ids, np.uint32)))
+
+    def named(self, identity: Longs, group: NDArray[np.int32]) -> Lights:
+        """Lights by their identities (k,), and the emitters of these; those that are not among these are dark."""
+        order = np.argsort(self.identity)
+        names = np.append(self.identity[order], -1)  # no light's: one there is at least
+        place = np.searchsorted(names[:-1], identity)
+        ids, here = np.append(order, 0)[place], names[place] == identity
+        arrays = self.arrays.take(on_device(mi.UInt32, ids.astype(np.uint32)), on_device(mi.Mask, here))
+        dr.eval(arrays)
+        return Lights(arrays, self.kinds.surfaces, group, self.names, self.clamp, self.radius, identity)
 
     @cached_property
     def flux(self) -> Doubles:
@@ -144,12 +160,33 @@ class Lights:
         }
 
 
+class LightCounts(NamedTuple):
+    """How many lights each emitter has.
+
+    Attributes
+    ----------
+    power : (emitters,) float64
+        Radiant flux into the scene: lights and particles are shared out by it.
+    sky : int
+        Directions that stand for the environment, those of its sun counted in.
+    particles : int
+    clamp : float
+        See ``LightOptions``.
+    """
+
+    power: Doubles
+    sky: int
+    particles: int
+    clamp: float
+
+
 class _Part(NamedTuple):
-    """Some lights, the interactions of those on glossy surfaces, and the emitter that each descends from."""
+    """Some lights, interactions of those on glossy surfaces, the emitter that each descends from, and its identity."""
 
     arrays: LightArrays
     glossy: mi.SurfaceInteraction3f | None
     group: NDArray[np.int32]
+    identity: Longs
 
 
 class _Source:
@@ -214,7 +251,11 @@ class _Source:
         )
 
 
-def scene_lights(scene: mi.Scene, options: LightOptions = LightOptions()) -> Lights:  # noqa: B008
+def scene_lights(
+    scene: mi.Scene,
+    options: LightOptions = LightOptions(),  # noqa: B008
+    counts: LightCounts | None = None,
+) -> Lights:
     """Turn all light of a scene into point lights and directions.
 
     Area lamps become stratified points that send out light by the cosine; environments (``envmap``, ``constant``,
@@ -226,6 +267,8 @@ def scene_lights(scene: mi.Scene, options: LightOptions = LightOptions()) -> Lig
     scene : mi.Scene
         World units.
     options : LightOptions
+    counts : LightCounts, optional
+        Those of ``count_lights`` for this scene, if not given; or for how it was in another frame.
 
     Returns
     -------
@@ -238,21 +281,54 @@ def scene_lights(scene: mi.Scene, options: LightOptions = LightOptions()) -> Lig
         An emitter of another kind, a medium, or light that is not finite.
     """
     source = _Source(scene)
+    counts = counts or _counts(source, options)
+    share, seed = _shares(source, counts.power, options), options.seed
+    parts = [_distant(source, counts.sky, seed), _placed(source, counts.power)]
+    parts += [_area(source, k, max(FEWEST, round(share[k])), seed) for k in source.areas if k in share]
+    if counts.particles:
+        parts += _landed(source, counts.power, counts.particles, options, _PARTICLES)
+    return _together([part for part in parts if len(part.group)], source, counts.clamp)
+
+
+def count_lights(scene: mi.Scene, options: LightOptions = LightOptions()) -> LightCounts:  # noqa: B008
+    """How many lights ``scene_lights`` gives each emitter.
+
+    Raises
+    ------
+    PrtError
+        As ``scene_lights``.
+    """
+    return _counts(_Source(scene), options)
+
+
+def mean_counts(counts: Sequence[LightCounts]) -> LightCounts:
+    """The mean of several frames."""
+    power, sky, particles, clamp = (np.mean(column, axis=0) for column in zip(*counts, strict=True))
+    return LightCounts(power, round(sky), round(particles), float(clamp))
+
+
+def _counts(source: _Source, options: LightOptions) -> LightCounts:
     power = _powers(source, options.seed)
-    reflects = options.max_depth != 2 and source.radius > 0 and power.any()
-    direct = max(1, round(options.count * (1 - options.indirect * reflects)))
-    shining = [k for k in (*source.areas, source.environment) if k >= 0 and power[k] > 0]
-    share = {k: direct * power[k] / power[shining].sum() for k in shining}
-    parts = [_distant(source, round(share.get(source.environment, 0)), options.seed), _placed(source, power)]
-    parts += [
-        _area(source, k, max(FEWEST, round(share[k])), options.seed) for k in source.areas if k in share
-    ]
-    if reflects and options.count > direct:
-        parts.append(_reflected(source, power, options.count - direct, options))
+    sky = round(_shares(source, power, options).get(source.environment, 0))
+    indirect = options.count - _direct(source, power, options)
+    particles = _particles(source, power, indirect, options) if indirect > 0 else 0
     clamp = options.clamp
     if clamp is None:
         clamp = 1 / (NEAR * source.radius) ** 2 if source.radius else np.inf
-    return _together([part for part in parts if len(part.group)], source, clamp)
+    return LightCounts(power, _with_sun(source, sky, options.seed), particles, clamp)
+
+
+def _direct(source: _Source, power: Doubles, options: LightOptions) -> int:
+    """How many lights are not those of particles."""
+    reflects = options.max_depth != 2 and source.radius > 0 and power.any()
+    return max(1, round(options.count * (1 - options.indirect * reflects)))
+
+
+def _shares(source: _Source, power: Doubles, options: LightOptions) -> dict[int, float]:
+    """Of direct lights, how many each area lamp and the environment have, if they shine."""
+    shining = [k for k in (*source.areas, source.environment) if k >= 0 and power[k] > 0]
+    direct = _direct(source, power, options)
+    return {k: direct * power[k] / power[shining].sum() for k in shining}
 
 
 def _powers(source: _Source, seed: int) -> Doubles:
@@ -269,25 +345,31 @@ def _powers(source: _Source, seed: int) -> Doubles:
     return power
 
 
+def _with_sun(source: _Source, count: int, seed: int) -> int:
+    """As many directions as leave so many in the sky, if there is a sun in it."""
+    if not count or source.emitters[source.environment].class_name() != SUN:
+        return count
+    direction, _, radiance = _directions(source, PILOT, seed)
+    return round(count / max(1 - _in_sun(direction, radiance).mean(), 0.05))
+
+
 def _distant(source: _Source, count: int, seed: int) -> _Part:
     """Stratified directions of the environment; what is within the rim of a sun is one light."""
     if not count:
         return _part(no_lights(0), source.environment)
-    sun = source.emitters[source.environment].class_name() == SUN
-    if sun:  # as many samples as leave so many lights in the sky
-        direction, _, radiance = _directions(source, PILOT, seed)
-        count = round(count / max(1 - _in_sun(direction, radiance).mean(), 0.05))
     direction, power, radiance = _directions(source, count, seed)
-    if sun:
+    number = np.arange(len(power))
+    if source.emitters[source.environment].class_name() == SUN:
         inside = _in_sun(direction, radiance)
         mean = power[inside].sum(axis=1) @ direction[inside]
         direction = np.concatenate([direction[~inside], mean[None] / max(np.linalg.norm(mean), 1e-30)])
         power = np.concatenate([power[~inside], power[inside].sum(axis=0, keepdims=True)])
+        number = np.append(number[~inside], len(inside))
     lights = no_lights(len(power))
     lights.kind = dr.full(mi.UInt32, DIRECTION, len(power))
     lights.place = mi.Point3f(np.ascontiguousarray(direction.T, np.float32))
     lights.power = mi.Color3f(np.ascontiguousarray(power.T, np.float32))
-    return _part(lights, source.environment)
+    return _part(lights, source.environment, number)
 
 
 def _directions(source: _Source, count: int, seed: int) -> tuple[Doubles, Doubles, Doubles]:
@@ -318,7 +400,7 @@ def _placed(source: _Source, power: Doubles) -> _Part:
         lights.place = dr.select(far, mi.Point3f(found.d), found.p)
         mean = mi.Color3f(on_device(mi.Float, (power[numbers] / (4 * np.pi)).astype(np.float32)))
         lights.power = dr.select(far, mi.Color3f(weight), mean)
-    return _Part(lights, None, numbers)
+    return _Part(lights, None, numbers, _identity(numbers, 0))
 
 
 def _area(source: _Source, number: int, count: int, seed: int) -> _Part:
@@ -339,31 +421,43 @@ def _area(source: _Source, number: int, count: int, seed: int) -> _Part:
     return _part(lights, number)
 
 
-def _reflected(source: _Source, power: Doubles, count: int, options: LightOptions) -> _Part:
-    """About so many lights where particles land; a few particles tell first how often each does."""
-
-    def landed(particles: int, key: int) -> list[_Part]:
-        def emit(particle: mi.UInt32) -> tuple[mi.Ray3f, mi.Color3f, mi.UInt32, mi.PCG32]:
-            place = (np.arange(particles) + 0.5) / particles
-            number = np.searchsorted(np.cumsum(power) / power.sum(), place).clip(max=len(power) - 1)
-            emitter = on_device(mi.UInt32, number.astype(np.uint32))
-            rng = _random(particles, options.seed, key)
-            ray, flux = source.rays(emitter, rng)
-            scale = power.sum() / (power[number] * particles)
-            return ray, flux * on_device(mi.Float, scale.astype(np.float32)), emitter, rng
-
-        found = trace_particles(source.scene, emit, particles, options.max_depth)
-        return [
-            _Part(*reflected_lights(one, source.surfaces), one.emitter.numpy().astype(np.int32))
-            for one in found
-        ]
-
-    pilot = sum(int(dr.count(dr.max(part.arrays.power) > 0)[0]) for part in landed(PILOT, _PILOT))
-    return _one(landed(max(1, round(count * PILOT / pilot)), _PARTICLES) if pilot else [])
+def _particles(source: _Source, power: Doubles, count: int, options: LightOptions) -> int:
+    """How many particles leave about so many lights: a few tell first how often each lands."""
+    found = _landed(source, power, PILOT, options, _PILOT)
+    pilot = sum(int(dr.count(dr.max(part.arrays.power) > 0)[0]) for part in found)
+    return max(1, round(count * PILOT / pilot)) if pilot else 0
 
 
-def _part(lights: LightArrays, number: int) -> _Part:
-    return _Part(lights, None, np.full(dr.width(lights.kind), number, np.int32))
+def _landed(source: _Source, power: Doubles, particles: int, options: LightOptions, key: int) -> list[_Part]:
+    """Lights where particles land, a part for each number of surfaces met; emitters have particles by their power."""
+
+    def emit(particle: mi.UInt32) -> tuple[mi.Ray3f, mi.Color3f, mi.UInt32, mi.PCG32]:
+        place = (np.arange(particles) + 0.5) / particles
+        number = np.searchsorted(np.cumsum(power) / power.sum(), place).clip(max=len(power) - 1)
+        emitter = on_device(mi.UInt32, number.astype(np.uint32))
+        rng = _random(particles, options.seed, key)
+        ray, flux = source.rays(emitter, rng)
+        scale = power.sum() / (power[number] * particles)
+        return ray, flux * on_device(mi.Float, scale.astype(np.float32)), emitter, rng
+
+    found = []
+    for one in trace_particles(source.scene, emit, particles, options.max_depth):
+        group = one.emitter.numpy().astype(np.int32)
+        identity = _identity(one.depth.numpy(), one.particle.numpy().astype(np.int64), True)
+        found.append(_Part(*reflected_lights(one, source.surfaces), group, identity))
+    return found
+
+
+def _part(lights: LightArrays, emitter: int, number: Longs | None = None) -> _Part:
+    """Direct lights of an emitter, which are numbered from 0 if not otherwise."""
+    size = dr.width(lights.kind)
+    group = np.full(size, emitter, np.int32)
+    return _Part(lights, None, group, _identity(group, np.arange(size) if number is None else number))
+
+
+def _identity(kind: NDArray[np.integer], number: NDArray[np.integer] | int, reflected: bool = False) -> Longs:
+    """See ``Lights``: of a direct light its emitter, of a reflected one its depth, and its number among those."""
+    return np.asarray((2 * kind.astype(np.int64) + reflected) << 40 | number)
 
 
 def _one(parts: list[_Part]) -> _Part:
@@ -382,14 +476,15 @@ def _one(parts: list[_Part]) -> _Part:
                 first += size
         dr.eval(glossy)
     group = np.concatenate([np.zeros(0, np.int32), *(part.group for part in parts)])
-    return _Part(joined([part.arrays for part in parts]), glossy, group)
+    identity = np.concatenate([np.zeros(0, np.int64), *(part.identity for part in parts)])
+    return _Part(joined([part.arrays for part in parts]), glossy, group, identity)
 
 
 def _together(parts: list[_Part], source: _Source, clamp: float) -> Lights:
     """All lights that are not dark, directions first, along a curve through them: rays of neighbours are coherent."""
     whole = _one(parts)
     if not len(whole.group):
-        return Lights(whole.arrays, None, whole.group, source.names, clamp, source.radius)
+        return Lights(whole.arrays, None, whole.group, source.names, clamp, source.radius, whole.identity)
     power = whole.arrays.power.numpy()
     if not np.isfinite(power).all():
         bad = source.names[whole.group[np.flatnonzero(~np.isfinite(power).all(axis=0))[0]]]
@@ -397,15 +492,19 @@ def _together(parts: list[_Part], source: _Source, clamp: float) -> Lights:
             f"emitter '{bad}' sends out light, or a surface reflects it, that is not finite: repair it"
         )
     lit = np.flatnonzero((power > 0).any(axis=0))
-    place, kind = whole.arrays.place.numpy().T[lit], whole.arrays.kind.numpy()[lit]
-    far = kind == DIRECTION
-    order = np.concatenate(
-        [np.flatnonzero(m)[morton_order(place[m], np.arange(m.sum(), dtype=np.uint64))] for m in (far, ~far)]
-    )
-    ids = lit[order]
+    place, far = whole.arrays.place.numpy().T[lit], whole.arrays.kind.numpy()[lit] == DIRECTION
+    ids = lit[order_lights(place, far)]
     arrays = whole.arrays.take(on_device(mi.UInt32, ids.astype(np.uint32)))
     dr.eval(arrays)
-    return Lights(arrays, whole.glossy, whole.group[ids], source.names, clamp, source.radius)
+    group, identity = whole.group[ids], whole.identity[ids]
+    return Lights(arrays, whole.glossy, group, source.names, clamp, source.radius, identity)
+
+
+def order_lights(place: Floats, far: NDArray[np.bool_]) -> Longs:
+    """Numbers of lights (n, 3), directions first, along a curve through them."""
+    return np.concatenate(
+        [np.flatnonzero(m)[morton_order(place[m], np.arange(m.sum(), dtype=np.uint64))] for m in (far, ~far)]
+    )
 
 
 def _square(count: int) -> int:

@@ -20,12 +20,13 @@ LEAST_COSINE = 1e-3  # of shading normals, which a particle's flux is divided by
 
 @dataclass
 class Landed:
-    """Where particles landed, an array for each attribute (Dr.Jit): world, flux in RGB."""
+    """Where particles landed, an array for each attribute (Dr.Jit): world, flux in RGB; numbers of particles."""
 
     si: Any
     flux: Any
     depth: Any
     emitter: Any
+    particle: Any
 
 
 Emit = Callable[[mi.UInt32], tuple[mi.Ray3f, mi.Color3f, mi.UInt32, mi.PCG32]]
@@ -52,7 +53,8 @@ def trace_particles(scene: mi.Scene, emit: Emit, count: int, max_depth: int) -> 
     list of Landed
         One for each number of surfaces met, from 1.
     """
-    ray, flux, emitter, rng = emit(dr.arange(mi.UInt32, count))
+    particle = dr.arange(mi.UInt32, count)
+    ray, flux, emitter, rng = emit(particle)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     found, last = [], max_depth - 2 if max_depth >= 0 else LONGEST
     dr.eval(ray, flux, emitter, rng)
@@ -70,7 +72,8 @@ def trace_particles(scene: mi.Scene, emit: Emit, count: int, max_depth: int) -> 
         )
         goes_on = alive & (rng.next_float32() < survival)
         after = dr.select(goes_on, after / dr.maximum(survival, 1e-30), 0)
-        record = Landed(si, mi.Color3f(flux), dr.full(mi.UInt32, depth + 2, dr.width(flux)), emitter)
+        edges = dr.full(mi.UInt32, depth + 2, dr.width(flux))
+        record = Landed(si, mi.Color3f(flux), edges, emitter, particle)
         ray = si.spawn_ray(out)
         dr.eval(record, lands, goes_on, after, ray, rng, emitter)
         if len(here := dr.compress(lands)):
@@ -79,7 +82,8 @@ def trace_particles(scene: mi.Scene, emit: Emit, count: int, max_depth: int) -> 
         index = dr.compress(goes_on)
         if not len(index):
             break
-        ray, flux, rng, emitter = (dr.gather(type(x), x, index) for x in (ray, after, rng, emitter))
+        carried = ray, after, rng, emitter, particle
+        ray, flux, rng, emitter, particle = (dr.gather(type(x), x, index) for x in carried)
     return found
 
 

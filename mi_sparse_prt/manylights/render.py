@@ -225,11 +225,16 @@ class RowColumn:
     settings : Settings
     run : Run
         Its clock tells where time goes.
+    flux : (n,) float64, optional
+        Of the lights, for columns that no row sees: that which they have, if not given.
     """
 
-    def __init__(self, elements: Elements, settings: Settings, run: Run) -> None:
+    def __init__(
+        self, elements: Elements, settings: Settings, run: Run, flux: NDArray[np.float64] | None = None
+    ) -> None:
         self.elements, self.settings, self.run = elements, settings, run
         self.samples, self.lights = elements.samples, elements.lights
+        self._flux = self.lights.flux if flux is None else flux
         self.rows, self.columns = settings.rows, settings.columns
         self.layers: dict[str, Floats] = {}
         self.tries: list[dict[str, float]] = []
@@ -292,8 +297,8 @@ class RowColumn:
         """
         with self.run.clock.phase("clustering"):
             if ids is None:
-                return self._partition(reduced, columns, self.lights.flux)
-            found = self._partition(reduced.of_lights(ids), columns, self.lights.flux[ids])
+                return self._partition(reduced, columns, self._flux)
+            found = self._partition(reduced.of_lights(ids), columns, self._flux[ids])
             return found.numbered(ids, len(self.lights))
 
     def _partition(self, reduced: ReducedColumns, columns: int, flux: NDArray[np.float64]) -> Partition:

@@ -50,7 +50,9 @@ def load_mitsuba(path: str | Path, **parameters: Any) -> mi.Scene:
     if not path.is_file():
         raise PrtError(f"scene file {path} does not exist: check the path")
     try:
-        loaded = mi.load_file(str(path), optimize=False, **{k: str(v) for k, v in parameters.items()})
+        # parallel loading numbers what it finds in another order each time, and kernels would be compiled again
+        options = {"optimize": False, "parallel": False}
+        loaded = mi.load_file(str(path), **options, **{k: str(v) for k, v in parameters.items()})
     except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others, over many lines
         reason = _one_line(error).replace(f"{path} ", "")
         raise PrtError(f"scene file {path} cannot be loaded: {reason}") from error

@@ -100,11 +100,12 @@ def column(name: str, foot: Triple, radius: float, height: float, material: str)
     return [shaft, *ends]
 
 
-def panel(name: str, centre: Triple, half: tuple[float, float], radiance: Triple) -> str:
-    """An area lamp that faces down."""
+def panel(name: str, centre: Triple, half: tuple[float, float], radiance: Triple, moved: str = "") -> str:
+    """An area lamp that faces down, and goes along x with a parameter of the scene."""
+    move = f'<translate x="${moved}"/>' if moved else ""
     return (
         f'<shape type="rectangle" id="{name}"><transform name="to_world"><scale x="{half[0]:g}" y="{half[1]:g}"/>'
-        f'<rotate x="1" angle="90"/><translate value="{numbers(centre)}"/></transform>'
+        f'<rotate x="1" angle="90"/><translate value="{numbers(centre)}"/>{move}</transform>'
         f'<emitter type="area"><rgb name="radiance" value="{numbers(radiance)}"/></emitter></shape>'
     )
 
@@ -138,8 +139,9 @@ def colonnade() -> str:
 
 
 def room() -> str:
-    """A closed room with a counter; lamps above it and behind partitions."""
+    """A closed room with a counter; lamps above it, one of which slides, and behind partitions."""
     things = [
+        '<default name="slide" value="0"/>',
         diffuse("plaster", (0.7, 0.68, 0.62)),
         principled("floor", (0.4, 0.28, 0.18), 0.45),
         principled("steel", (0.7, 0.7, 0.72), 0.45, 1),
@@ -166,7 +168,7 @@ def room() -> str:
             f'<float name="radius" value="0.13"/><ref id="copper"/></shape>'
             for k, x in enumerate((-1.2, -0.5, 0.3))
         ),
-        panel("lamp_left", (-0.8, 1.74, -2.3), (0.35, 0.04), (30, 27, 22)),
+        panel("lamp_left", (-0.8, 1.74, -2.3), (0.35, 0.04), (30, 27, 22), "slide"),
         panel("lamp_right", (0.8, 1.74, -2.3), (0.35, 0.04), (30, 27, 22)),
         bulb("bulb_west", (-2.6, 1.6, -0.4), (9, 7, 5)),
         bulb("bulb_east", (2.6, 1.6, -0.4), (5, 6, 8)),

@@ -1,4 +1,4 @@
-"""Many lights, frames of a camera that moves: each is right, and nothing flickers."""
+"""Many lights, frames of a camera or of lamps that move: each is right, and nothing flickers."""
 
 import mitsuba as mi
 import numpy as np
@@ -8,14 +8,15 @@ from conftest import diffuse
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.core.run import Run
+from mi_sparse_prt.manylights.light_arrays import DIRECTION
+from mi_sparse_prt.manylights.lights import LightOptions, count_lights, mean_counts, scene_lights
 from mi_sparse_prt.manylights.render import Settings, matrix_of
 
 T = mi.ScalarTransform4f
 FEW = {"lights": 2000, "max_depth": 3}
 
 
-@pytest.fixture(scope="module")
-def scene() -> mi.Scene:
+def room() -> dict:
     wall = {"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.6)}
     ball = {"type": "sphere", "radius": 0.6, "bsdf": diffuse(0.7, 0.5, 0.2)}
     lamp = {
@@ -23,19 +24,22 @@ def scene() -> mi.Scene:
         "radius": 0.1,
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 30}},
     }
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor(0),
-            "floor": wall | {"to_world": T().rotate([1, 0, 0], -90).scale(3)},
-            "wall": wall | {"to_world": T().translate([0, 1, -2]).scale(3)},
-            "ball": ball | {"center": [-0.7, 0.6, 0]},
-            "other": ball | {"center": [0.8, 0.6, -0.6]},
-            "lamp": lamp | {"center": [0.2, 1.6, 0.9]},
-            "lamp2": lamp | {"center": [-1.6, 0.3, -1.2]},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.25, 0.3]}},
-        }
-    )
+    return {
+        "type": "scene",
+        "sensor": sensor(0),
+        "floor": wall | {"to_world": T().rotate([1, 0, 0], -90).scale(3)},
+        "wall": wall | {"to_world": T().translate([0, 1, -2]).scale(3)},
+        "ball": ball | {"center": [-0.7, 0.6, 0]},
+        "other": ball | {"center": [0.8, 0.6, -0.6]},
+        "lamp": lamp | {"center": [0.2, 1.6, 0.9]},
+        "lamp2": lamp | {"center": [-1.6, 0.3, -1.2]},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.25, 0.3]}},
+    }
+
+
+@pytest.fixture(scope="module")
+def scene() -> mi.Scene:
+    return mi.load_dict(room())
 
 
 def sensor(frame: float, size: int = 24) -> dict:
@@ -122,6 +126,84 @@ def test_groups_and_compensation_of_frames(scene, cameras) -> None:
     ):
         assert list(frame.layers) == ["lamp", "lamp2", "sky"]
         np.testing.assert_allclose(sum(frame.layers.values()), frame.image, rtol=1e-4, atol=1e-5)
+
+
+def moving_scene(frame: int) -> mi.Scene:
+    """A lamp moves, another fades in after the first frame, a ball rolls, the sky turns blue."""
+    scene = mi.load_dict(room())
+    known = mi.traverse(scene)
+    known["lamp.to_world"] = T().translate([0.2 - 0.03 * frame, 1.6, 0.9]).scale(0.1)
+    known["lamp2.emitter.radiance.value"] = mi.Color3f(10.0 * frame)
+    known["ball.to_world"] = T().translate([-0.7 + 0.02 * frame, 0.6, 0]).scale(0.6)
+    known["sky.radiance.value"] = mi.Color3f(0.2, 0.25, 0.3 + 0.02 * frame)
+    known.update()
+    return scene
+
+
+@pytest.fixture(scope="module")
+def moving_references() -> np.ndarray:
+    """All lights of each frame, those of the same seed."""
+    camera = mi.load_dict(sensor(0))
+    return np.concatenate([all_lights(moving_scene(frame), [camera], 0) for frame in range(8)])
+
+
+def test_moving_lamps_do_not_flicker(moving_references) -> None:
+    """Expected: as for a camera that moves."""
+    camera = mi.load_dict(sensor(0))
+    errors = frames_of(moving_scene, [camera] * 8, 100, 100) - moving_references
+    alone = [prt.render_many_lights(moving_scene(k), 100, 100, sensor=camera, **FEW).image for k in range(8)]
+    others = np.array(alone) - moving_references
+    flicker, beside = (np.linalg.norm(np.diff(e, axis=0)) for e in (errors, others))
+    print(f"flicker {flicker / beside:.2f} of {beside / np.linalg.norm(moving_references[1:]):.2%}")
+    print(f"errors {np.linalg.norm(errors) / np.linalg.norm(others):.2f} of those of pictures")
+    assert flicker < beside / 3
+    assert np.linalg.norm(errors) < 1.5 * np.linalg.norm(others)
+
+
+def test_a_callable_of_one_scene_is_that_scene(scene, cameras) -> None:
+    """Expected: bit by bit."""
+    found = frames_of(lambda _: scene, cameras[:3], 10, 20)
+    assert np.array_equal(found, frames_of(scene, cameras[:3], 10, 20))
+
+
+@pytest.mark.slow
+def test_moving_frames_are_right_on_average() -> None:
+    """30 seeds of frames 0, 3 and 6, few rows. Expected: on average all lights, within 4 standard errors."""
+    camera, apart = [mi.load_dict(sensor(0, 12))], []
+    for seed in range(30):
+        found = frames_of(lambda k: moving_scene(3 * k), camera * 3, 20, 60, seed=seed)
+        whole = np.concatenate([all_lights(moving_scene(3 * k), camera, seed) for k in range(3)])
+        apart.append(found.mean(axis=(1, 2)) / whole.mean(axis=(1, 2)) - 1)
+    error = np.std(apart, axis=0, ddof=1) / np.sqrt(len(apart))
+    print("z", np.abs(np.mean(apart, axis=0) / error).max(), "error", error.max())
+    assert np.all(error < 0.005)  # so that 2% are seen
+    assert np.all(np.abs(np.mean(apart, axis=0)) < 4 * error)
+
+
+def test_other_emitters_are_refused() -> None:
+    def other(frame: int) -> mi.Scene:
+        return mi.load_dict({name: one for name, one in room().items() if not frame or name != "lamp2"})
+
+    found = prt.render_many_lights_frames(other, [0, 0], 4, 8, **FEW)
+    with pytest.raises(PrtError, match="frame 1 has the emitters lamp, sky, and frame 0 lamp, lamp2, sky"):
+        next(found)
+
+
+def test_a_sun_that_rises_does_not_change_the_sky(cameras) -> None:
+    """A sky's directions are as many in all frames, though its sun takes others out of them.
+
+    Expected: what is told of emitters has the same number of lights, but for those that the sun covers.
+    """
+
+    def morning(frame: int) -> mi.Scene:
+        sky = {"type": "sunsky", "sun_direction": [1, 0.3 + 0.1 * frame, 0.5], "sun_scale": 0.01}
+        return mi.load_dict(room() | {"sky": sky})
+
+    counts = mean_counts([count_lights(morning(k), LightOptions(2000)) for k in range(3)])
+    found = [scene_lights(morning(k), LightOptions(2000), counts) for k in range(3)]
+    sky = [set(one.identity[one.arrays.kind.numpy() == DIRECTION]) for one in found]
+    assert len(sky[0] & sky[1] & sky[2]) > 0.95 * max(map(len, sky))
+    assert len(list(prt.render_many_lights_frames(morning, [0, 0], 4, 8, **FEW))) == 2
 
 
 @pytest.mark.parametrize(

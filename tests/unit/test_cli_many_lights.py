@@ -9,7 +9,9 @@ from test_cli import SCENE, assert_one_line_error, call, entries
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.benchmark import many_lights as benchmark
+from mi_sparse_prt.cli.files import image_bytes
 from mi_sparse_prt.io.exr_layers import read_layers
+from mi_sparse_prt.scene.loading import load_mitsuba
 
 SMALL = ["--lights", 200, "--rows", 8, "--columns", 16, "--max-depth", 3]
 
@@ -77,6 +79,54 @@ def test_rows_and_columns_by_an_error(scene, tmp_path):
     assert call("many-lights", scene, "-o", tmp_path / "a.png", *arguments).exit_code == 0
     found = json.loads(report.read_text())
     assert found["tries"] and found["estimated_error"] <= 0.05
+
+
+def test_a_film_of_a_lamp_that_moves(scene, tmp_path):
+    """Expected: its frames are those of Python; a film's name makes a film, another one a folder."""
+    moving = scene.read_text().replace(
+        '<emitter type="point" id="bulb"/>',
+        '<default name="x" value="0"/><emitter type="point" id="bulb"><point name="position" value="$x, 0.2, 2"/>'
+        "</emitter>",
+    )
+    scene.write_text(moving)
+    film, folder, report = tmp_path / "a.mp4", tmp_path / "a", tmp_path / "a.json"
+    arguments = [*SMALL, "--frames", 3, "--animate", "x=-1:1", "--json", report]
+    result = call("many-lights", scene, "-o", folder, *arguments)
+    assert result.exit_code == 0 and "-1 to 1" in result.stdout
+    assert sorted(path.name for path in folder.iterdir()) == ["0000.png", "0001.png", "0002.png"]
+    told = json.loads(report.read_text())
+    found = prt.render_many_lights_frames(
+        lambda k: load_mitsuba(scene, x=k - 1.0), [0] * 3, 8, 16, lights=200, max_depth=3
+    )
+    for k, frame in enumerate(found):
+        assert told["frames"][k]["estimated_error"] == frame.report["estimated_error"]
+        expected = np.frombuffer(image_bytes(frame.image, ".png", 0.0), np.uint8)
+        assert np.array_equal(np.fromfile(folder / f"000{k}.png", np.uint8), expected)
+    assert call("many-lights", scene, "-o", film, *arguments, "-q").exit_code == 0
+    assert film.stat().st_size == json.loads(report.read_text())["film"]["bytes"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frames", 3], "nothing moves"),
+        (["--animate", "x=0:1"], "how many frames"),
+        (["--frames", 0, "--animate", "x=0:1"], "how many frames"),
+        (["--frames", 3, "--animate", "x=0"], "'x=0' is not NAME=FROM:TO"),
+        (["--frames", 3, "--animate", "0:1"], "'0:1' is not NAME=FROM:TO"),
+        (["--frames", 3, "--animate", "x=0:1", "--seconds", 3], "has --rows and --columns"),
+        (["--frames", 3, "--animate", "x=0:1", "--fps", 0], "not above 0"),
+        (["--frames", 3, "--animate", "x=0:1", "-o", "a.png"], "ends in .mp4"),
+    ],
+)
+def test_what_films_cannot_have(scene, tmp_path, arguments, message):
+    result = call("many-lights", scene, "-o", tmp_path / "a.mp4", *arguments)
+    assert result.exit_code == 2 and message in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_parameters_that_a_scene_does_not_have(scene, tmp_path):
+    arguments = ["--frames", 3, "--animate", "y=0:1"]
+    assert_one_line_error(call("many-lights", scene, "-o", tmp_path / "a.mp4", *arguments), "y")
 
 
 def test_many_lights_refuses_in_one_line(scene, tmp_path):

@@ -30,6 +30,25 @@ def many_lights_table(scene: str, report: dict[str, Any]) -> Table:
     return new_table(title, FACTS, facts, emitters, steps, memory)
 
 
+def film_table(report: dict[str, Any]) -> Table:
+    """Of frames by ``render_many_lights_frames``."""
+    frames, film = report["frames"], report["film"]
+    known = [one["estimated_error"] for one in frames if one["estimated_error"] is not None]
+    moves = [(name, f"{first:g} to {last:g}") for name, (first, last) in report["animate"].items()]
+    facts = [
+        ("rows of all frames, columns", f"{frames[0]['parameters']['rows']:,} and {frames[0]['columns']:,}"),
+        ("estimated error", f"{percent(min(known))} to {percent(max(known))}" if known else "not known"),
+        (
+            "time",
+            f"{duration(report['seconds'])}, {duration(report['seconds'] / len(frames))} for each frame",
+        ),
+        ("peak memory", byte_count(max(one["peak_memory_bytes"] for one in frames))),
+        (film["path"], byte_count(film["bytes"])),
+    ]
+    title = f"{report['scene']}: {film['frames']} frames, {frames[0]['lights']['total']:,} lights"
+    return new_table(title, FACTS, facts, moves)
+
+
 def _left_out(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Light that the matrix does not have, as shares of the mean radiance."""
     kinds = {"clamped": "by the clamp", "specular": "by mirrors, glass"}
