@@ -165,7 +165,9 @@ def _ask_again(
         fine = single / few**2 > MISSED * total
         for t in range(shares.shape[1]):
             if shares[i, t] >= 0 and (fine or again[i, t] > 0):
-                weight = np.dot(normals[i], weights[t])
+                weight = np.float32(0)  # numba counts who holds slices, which a product of vectors would take
+                for k in range(3):
+                    weight += normals[i, k] * weights[t, k]
                 chance = max(again[i, t], 1) / (BESIDE / 2)
                 strata = across * max(weight, np.float32(0)) ** 0.4 * chance**0.2
                 again[i, t] = min(max(few + 1, round(strata)), 255)

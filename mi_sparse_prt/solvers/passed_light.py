@@ -201,6 +201,15 @@ def _sum_beside(
             row[texels[k]] = 0
 
 
+@numba.njit
+def _cosine(normals: Floats, point: int, directions: Floats, texel: int) -> np.float32:
+    """Not of slices, of which it would be counted who holds them, by one thread at a time."""
+    total = np.float32(0)
+    for k in range(3):
+        total += normals[point, k] * directions[texel, k]
+    return total
+
+
 @numba.njit(nogil=True, cache=True)
 def _are_alike(
     first: int,
@@ -220,13 +229,13 @@ def _are_alike(
         own = range(begins[i], begins[i + 1])
         for k in own:
             texel = columns[k] % size
-            reaches = np.dot(normals[i], directions[texel]) * powers[texel]
+            reaches = _cosine(normals, i, directions, texel) * powers[texel]
             if reaches > 0:  # at the horizon 0 here, where the sum of three products was rounded otherwise
                 shares[texel], met[texel] = values[k] / reaches, columns[k] // size
         for k in range(starts[i], starts[i + 1]):
             share, same = shares[texels[k]], shares[texels[k]] > 0
             for texel in beside[texels[k]]:
-                if np.dot(normals[i], directions[texel]) > 0:
+                if _cosine(normals, i, directions, texel) > 0:
                     same &= met[texel] == met[texels[k]] and abs(shares[texel] - share) <= ALIKE * share
             alike[k] = same
         for k in own:

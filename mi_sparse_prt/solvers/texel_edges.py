@@ -34,6 +34,9 @@ STEPS = 4  # of bisection: an edge is known to a sixteenth of the way between tw
 BLOCK = 4096  # vertices at a time; their edges are traced together
 AROUND = 6  # texels that an edge between two of them may cut
 BYTE = np.uint32(0xFF)
+# Functions that make no arrays need not count who holds them: two threads that count the same ones wait for each other,
+# seven eighths of the time of all this.
+uncounted = numba.njit(_nrt=False)  # type: ignore[call-overload]  # an option that is not documented
 MANY = 4  # times their squares is the square of changes to shares by which these add up, and are not chance
 
 
@@ -177,7 +180,8 @@ def _find_shares(
     for i in range(start, end):
         at, pairs = room[i], crossings.pairs[crossings.starts[i] : crossings.starts[i + 1]]
         edge[pairs] = crossings.places[crossings.starts[i] : crossings.starts[i + 1]]
-        areas = _areas(sides, bits[i], above[i], edge, pairs, i, shared)
+        widened = _find_areas(sides, bits[i], above[i], edge, pairs, i, shared)
+        areas = shared.wide if widened else shared.areas
         for pair in pairs:
             for texel in sides.around[pair]:
                 if texel >= 0 and done[texel] != i and bit_of(above[i], texel):
@@ -201,7 +205,7 @@ def _find_shares(
 
 
 @numba.njit
-def _areas(
+def _find_areas(
     sides: Sides,
     bits: Bits,
     above: Bits,
@@ -209,8 +213,8 @@ def _areas(
     pairs: NDArray[np.uint32],
     vertex: int,
     room: _Room,
-) -> NDArray[np.float32]:
-    """Visible shares (n_directions,) of the texels around pairs of a vertex; what others have is of no account.
+) -> bool:
+    """Find the visible shares of the texels around pairs of a vertex: ``room.areas``, or whether ``room.wide`` it is.
 
     As they are traced; or, if that changes their sum by more than chance, what is narrower than a texel one texel wide.
     """
@@ -236,10 +240,10 @@ def _areas(
             room.areas[texel], room.wide[texel] = area, wide
     for pair in pairs:
         room.moved[pair] = -1.0
-    return room.wide if change * change > MANY * square else room.areas
+    return change * change > MANY * square
 
 
-@numba.njit
+@uncounted
 def _widened(sides: Sides, edge: NDArray[np.float32], pair: int, first: int, second: int) -> float:
     """Where visibility changes between the texels of a pair, so that what is narrower than a texel is one texel wide.
 
@@ -255,13 +259,13 @@ def _widened(sides: Sides, edge: NDArray[np.float32], pair: int, first: int, sec
     return min(max(there, 0.0), 1.0)
 
 
-@numba.njit
+@uncounted
 def _missing(here: float, there: float) -> float:
     """How much farther from a texel's centre a crossing would be, if it and the opposite one were 1 apart."""
     return here / (here + there) - here if there >= 0 and 0 < here + there < 1 else 0.0
 
 
-@numba.njit
+@uncounted
 def _opposite(sides: Sides, edge: NDArray[np.float32], pair: int, texel: int) -> float:
     """How far from a texel's centre visibility changes on the other side than towards a pair's texel, or -1."""
     for k in range(4):
@@ -271,7 +275,7 @@ def _opposite(sides: Sides, edge: NDArray[np.float32], pair: int, texel: int) ->
     return -1.0
 
 
-@numba.njit
+@uncounted
 def _is_speck(sides: Sides, edge: NDArray[np.float32], texel: int) -> bool:
     """Whether a texel is of another kind than the four beside it, and what is there not larger than it, if round.
 
@@ -289,7 +293,7 @@ def _is_speck(sides: Sides, edge: NDArray[np.float32], texel: int) -> bool:
     return width * height <= 4 / np.pi
 
 
-@numba.njit
+@uncounted
 def _listed(texel: int, share: float, bit: np.uint32, entries: NDArray[np.uint32], at: int) -> int:
     """Add an entry, unless the bit says as much; return where the next one goes."""
     value = np.uint32(share * FULL + 0.5)
@@ -316,7 +320,7 @@ def _unpack(
             shares[starts[i] + e] = entry & BYTE
 
 
-@numba.njit
+@uncounted
 def _mean_around(sides: Sides, bits: Bits, above: Bits, texel: int) -> float:
     """Share of the texels around one that are seen, of those above the horizon."""
     known, seen = 0, 0
@@ -328,7 +332,7 @@ def _mean_around(sides: Sides, bits: Bits, above: Bits, texel: int) -> float:
     return seen / known
 
 
-@numba.njit
+@uncounted
 def _area(sides: Sides, bits: Bits, above: Bits, edge: NDArray[np.float32], texel: int) -> float:
     """Visible share of a texel, quadrant by quadrant; below the horizon everything goes on as above it."""
     area, a = 0.0, bit_of(bits, texel)
@@ -346,13 +350,13 @@ def _area(sides: Sides, bits: Bits, above: Bits, edge: NDArray[np.float32], texe
     return area
 
 
-@numba.njit
+@uncounted
 def _continued(bits: Bits, above: Bits, texel: int, otherwise: np.uint32) -> np.uint32:
     """The bit of a texel, if there is such a texel above the horizon."""
     return bit_of(bits, texel) if texel >= 0 and bit_of(above, texel) else otherwise
 
 
-@numba.njit
+@uncounted
 def _place(edge: NDArray[np.float32], way: int, otherwise: float) -> float:
     """Where on a way (twice a pair, plus 1 if backwards) visibility changes, if that is known."""
     if way < 0 or edge[way // 2] < 0:
@@ -360,7 +364,7 @@ def _place(edge: NDArray[np.float32], way: int, otherwise: float) -> float:
     return 1 - edge[way // 2] if way % 2 else edge[way // 2]
 
 
-@numba.njit
+@uncounted
 def _quadrant(
     ab_differ: bool, ac_differ: bool, bd_differ: bool, ab: float, ac: float, bd: float, cd: float
 ) -> float:
@@ -381,7 +385,7 @@ def _quadrant(
     return _cut_off(1.0, bd, cd, 1.0)
 
 
-@numba.njit
+@uncounted
 def _cut_off(px: float, py: float, qx: float, qy: float) -> float:
     """Area of [0, 1/2]^2 on the origin's side of the line through two points."""
     a, b = qy - py, px - qx
