@@ -261,6 +261,25 @@ def test_errors_in_light_are_those_of_random_skies():
     assert (error.lit < error.whole).all()
 
 
+@pytest.mark.parametrize("roughness", [0.02, 0.05])
+def test_what_is_not_known_is_no_small_error(roughness):
+    """
+    Rationale: the squared error is a mean of products, of which next to none find the lobe of lacquer. It may be below
+    0, was taken for 0 then (of 9 terms, and all but those), and these drew balls of 30 times their light.
+    Expected: errors of all numbers of terms are those of a lobe that the grid does not have.
+    """
+    lacquer = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": 0.0},
+            "roughness": roughness,
+            "specular": 0.9,
+        }
+    )
+    error = measure_factor_error(factor_brdf(lacquer, "ball", 16), lacquer, "ball")
+    assert (error.lit > 1).all()
+
+
 def test_same_seed_same_factors():
     a, b = (factor_brdf(phong(10), "ball", 4, SMALL, seed=3) for _ in range(2))
     assert np.array_equal(a.incident, b.incident) and np.array_equal(a.outgoing, b.outgoing)

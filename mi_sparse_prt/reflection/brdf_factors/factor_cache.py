@@ -23,7 +23,7 @@ from mi_sparse_prt.reflection.brdf_factors.factorization import MOST_TERMS, Brdf
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.notes import Notes
 
-FORMAT = 3  # of the files; another one whenever factors of the same BSDF would be others
+FORMAT = 4  # of the files; another one whenever factors of the same BSDF would be others
 
 ERRORS = ("whole", "grazing", "peak", "lit")
 

@@ -83,7 +83,8 @@ def _errors_in_light(factors: BrdfFactors, bsdf: mi.BSDF, name: str, seed: int, 
     """Errors (K,) of radiance under random light, see ``FactorError.lit``.
 
     For each of some outgoing directions, two independent sets of incident ones integrate an error. The mean product of
-    the two integrals is the squared error, without the noise of either; so it is with the radiance itself.
+    the two integrals is the squared error, without the noise of either; so it is with the radiance itself. An error is
+    no smaller than what noise there is lets know.
     """
     half = 128  # incident directions in a set
     rng = np.random.default_rng([seed, 1])
@@ -98,7 +99,10 @@ def _errors_in_light(factors: BrdfFactors, bsdf: mi.BSDF, name: str, seed: int, 
     a, b = np.moveaxis(values.reshape(len(values), views, 2, half, -1), 2, 0)
     angles = np.swapaxes(wi.astype(np.float64).reshape(views, 2, half, 3), 0, 1)
     light = _light_at_angle(angles[0] @ np.swapaxes(angles[1], 1, 2))  # [view, first, second]
-    squares = np.maximum(np.einsum("kvac,vab,kvbc->k", a, light, b, optimize=True), 0)
+    of_views = np.einsum("kvac,vab,kvbc->kv", a, light, b, optimize=True)
+    # where few of the directions find a narrow lobe, the sum says next to nothing, and may be below 0
+    noise = np.sqrt(views) * of_views.std(axis=1)
+    squares = np.maximum(of_views.sum(axis=1), noise)
     return np.array([relative_l2_from_squares(square, squares[0]) for square in squares[1:]])
 
 
