@@ -136,11 +136,7 @@ class _MovingShot(_Shot):
         found = []
         for frame in range(len(self)):
             scene, _ = self._view(frame)
-            if (names := self._emitters(scene)) != self._names:
-                raise PrtError(
-                    f"frame {frame} has the emitters {', '.join(names) or 'none'}, and frame 0 "
-                    f"{', '.join(self._names) or 'none'}: give all frames the same"
-                )
+            self._check(frame, self._emitters(scene))
             found.append(count_lights(scene, self.asked.light_options()))
         self._counts = mean_counts(found)
 
@@ -153,7 +149,20 @@ class _MovingShot(_Shot):
         return find_view(self._moving(frame), self._sensors[frame])
 
     def _emitters(self, scene: mi.Scene) -> list[str]:
-        return sorted(named_emitters(scene, [shape.id() for shape in scene.shapes()]))
+        numbers = named_emitters(scene, [shape.id() for shape in scene.shapes()])
+        return sorted(numbers, key=lambda name: numbers[name])
+
+    def _check(self, frame: int, names: list[str]) -> None:
+        """Refuse frames whose lights cannot be those of the first one."""
+        if sorted(names) != sorted(self._names):
+            raise PrtError(
+                f"frame {frame} has the emitters {', '.join(names) or 'none'}, and frame 0 "
+                f"{', '.join(self._names) or 'none'}: give all frames the same"
+            )
+        if names != self._names:
+            raise PrtError(
+                f"frame {frame} has its emitters in another order than frame 0: load scenes with parallel=False"
+            )
 
 
 def _frames(shot: _Shot, run: Run) -> Iterator[ManyLightsImage]:

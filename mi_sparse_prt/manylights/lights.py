@@ -149,12 +149,12 @@ class Lights:
         )
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Direct and indirect lights of each emitter."""
-        indirect = self.arrays.depth.numpy() > 2
+        """Direct and indirect lights of each emitter; ``named`` ones that are dark are not counted."""
+        depth = self.arrays.depth.numpy()
         return {
             name: {
-                "direct": int(((self.group == k) & ~indirect).sum()),
-                "indirect": int(((self.group == k) & indirect).sum()),
+                "direct": int(((self.group == k) & (depth == 2)).sum()),
+                "indirect": int(((self.group == k) & (depth > 2)).sum()),
             }
             for k, name in enumerate(self.names)
         }

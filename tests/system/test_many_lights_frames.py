@@ -189,6 +189,26 @@ def test_other_emitters_are_refused() -> None:
         next(found)
 
 
+def test_another_order_of_emitters_is_refused() -> None:
+    """Files that are loaded in parallel have one now and then."""
+
+    def other(frame: int) -> mi.Scene:
+        names = sorted(room(), reverse=bool(frame))
+        return mi.load_dict({name: room()[name] for name in names}, parallel=False, optimize=False)
+
+    found = prt.render_many_lights_frames(other, [0, 0], 4, 8, **FEW)
+    with pytest.raises(PrtError, match="frame 1 has its emitters in another order than frame 0"):
+        next(found)
+
+
+def test_lights_of_a_frame_are_counted() -> None:
+    """Expected: of the lamp that is dark in the first frame, none there, and some later."""
+    found = list(prt.render_many_lights_frames(moving_scene, [0, 0], 4, 8, **FEW))
+    counts = [frame.report["lights"]["emitters"]["lamp2"] for frame in found]
+    assert counts[0] == {"direct": 0, "indirect": 0}
+    assert counts[1]["direct"] > 0 and counts[1]["indirect"] > 0
+
+
 def test_a_sun_that_rises_does_not_change_the_sky(cameras) -> None:
     """A sky's directions are as many in all frames, though its sun takes others out of them.
 
