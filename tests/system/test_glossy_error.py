@@ -277,7 +277,7 @@ def test_the_report_has_all_that_a_diffuse_one_has(coloured):
         ("auto", "direction"),
         pytest.param("auto", "texel", marks=pytest.mark.slow),
         ("gather", "direction"),
-        ("gather", "texel"),
+        pytest.param("gather", "texel", marks=pytest.mark.slow),
     ],
 )
 def test_a_target_error_is_met_by_more_rays(method, basis):
