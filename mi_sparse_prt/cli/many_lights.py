@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-FILM = ".mp4"
-
-
 class ManyLightsMethod(StrEnum):
     """Which form of the algorithm."""
 
@@ -100,9 +97,6 @@ Preview = Annotated[
     ),
 ]
 Exposure = Annotated[float, typer.Option(help="Stops by which .png files, or all of a film, are brightened.")]
-FrameCount = Annotated[
-    int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
-]
 Animate = Annotated[
     list[str] | None,
     typer.Option(
@@ -111,7 +105,6 @@ Animate = Annotated[
         show_default=False,
     ),
 ]
-FrameRate = Annotated[float, typer.Option("--fps", help="Frames of a film per second.")]
 
 
 @dataclass(frozen=True)
@@ -125,7 +118,7 @@ class _Film:
 
     @property
     def is_folder(self) -> bool:
-        return self.output.suffix.lower() != FILM
+        return not options.is_film(self.output)
 
     def parameters(self, frame: int) -> dict[str, str]:
         """Of a frame, as ``load_scene`` takes them."""
@@ -150,9 +143,9 @@ def many_lights(
     seed: Seed = 0,
     groups: Groups = False,
     preview: Preview = False,
-    frames: FrameCount = None,
+    frames: options.FrameCount = None,
     animate: Animate = None,
-    fps: FrameRate = 30.0,
+    fps: options.FrameRate = 30.0,
     exposure: Exposure = 0.0,
     define: options.Define = None,
     variant: options.Variant = None,
@@ -277,14 +270,11 @@ def _render_film(
 
 def _asked_film(output: Path, frames: int | None, animate: list[str] | None, fps: float) -> _Film:
     """What --frames and --animate say (typer.BadParameter)."""
-    if frames is None or frames < 1:
-        raise typer.BadParameter("give how many frames the film has, 1 or more", param_hint="--frames")
+    if frames is None:
+        raise typer.BadParameter("give how many frames the film has", param_hint="--frames")
     if not animate:
         raise typer.BadParameter("nothing moves: give --animate NAME=FROM:TO", param_hint="--frames")
-    if not 0 < fps < float("inf"):
-        raise typer.BadParameter(f"{fps} is not above 0", param_hint="--fps")
-    if output.suffix.lower() not in ("", FILM):
-        raise typer.BadParameter(f"{output}: give a name that ends in {FILM}, or a folder", param_hint="-o")
+    options.check_film(output, frames, fps)
     ranges = {}
     for name, value in options.definitions(animate, "--animate", "NAME=FROM:TO").items():
         try:

@@ -55,6 +55,31 @@ def definitions(pairs: list[str] | None, option: str = "-D", form: str = "NAME=V
     return {name: value for name, _, value in split}
 
 
+FILM = ".mp4"
+FrameCount = Annotated[
+    int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
+]
+FrameRate = Annotated[float, typer.Option("--fps", help="Frames of a film per second.")]
+
+
+def is_film(output: Path) -> bool:
+    """Whether frames are to be a film file, and no folder of pictures."""
+    return output.suffix.lower() == FILM and not output.is_dir()
+
+
+def check_film(output: Path, frames: int, fps: float) -> None:
+    """Refuse a film that cannot be made (typer.BadParameter)."""
+    if frames < 1:
+        raise typer.BadParameter(f"{frames} frames: give 1 or more", param_hint="--frames")
+    if not 0.1 <= fps <= 1000:
+        raise typer.BadParameter(f"{fps} frames per second: give 0.1 to 1000", param_hint="--fps")
+    if not (is_film(output) or output.is_dir() or output.suffix == ""):
+        raise typer.BadParameter(
+            f"{output}: give a name that ends in {FILM}, or a folder without a dot in its name",
+            param_hint="-o",
+        )
+
+
 def file_argument(metavar: str, help: str) -> Any:
     """A file that a command is about."""
     return typer.Argument(metavar=metavar, help=help, show_default=False)

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from mi_sparse_prt import Environment, LightTransport, Scene
     from mi_sparse_prt.core.profiling import Stopwatch
 
-FILM = ".mp4"
-
 EnvironmentFile = Annotated[
     Path | None,
     options.file_option(
@@ -54,9 +52,6 @@ Rotate = Annotated[
 Exposure = Annotated[
     float, typer.Option(metavar="STOPS", help="Brighten a .png, or all of a film, by this power of two.")
 ]
-FrameCount = Annotated[
-    int | None, typer.Option("--frames", help="Make a film of so many frames.", show_default=False)
-]
 Each = Annotated[
     int | None,
     typer.Option(
@@ -72,7 +67,6 @@ LastEnvironment = Annotated[
         "--to", metavar="ENV", help="Environment of the last frame: the light becomes this one step by step."
     ),
 ]
-FrameRate = Annotated[float, typer.Option("--fps", help="Frames of a film per second.")]
 Sensor = Annotated[int, typer.Option(help="Which of the scene's cameras.")]
 Samples = Annotated[
     int, typer.Option(help="Samples per pixel, for edges and textures: the light has no noise.")
@@ -117,9 +111,9 @@ def relight(
     vertices: VerticesFile = None,
     rotate: Rotate = 0.0,
     exposure: Exposure = 0.0,
-    frames: FrameCount = None,
+    frames: options.FrameCount = None,
     to: LastEnvironment = None,
-    fps: FrameRate = 30.0,
+    fps: options.FrameRate = 30.0,
     each: Each = None,
     sensor: Sensor = 0,
     spp: Samples = 64,
@@ -147,7 +141,7 @@ def relight(
     if environment is None:
         raise typer.BadParameter("no light: give -e ENVIRONMENT, or --each LIGHTS", param_hint="-e")
     _check_files(output, vertices, to, frames, fps)
-    folder = frames is not None and output is not None and not _is_film(output)
+    folder = frames is not None and output is not None and not options.is_film(output)
     with running(json_file, quiet, outputs=[None if folder else output, vertices]) as command:
         # before the clock starts
         from mi_sparse_prt import load_environment, load_transport
@@ -271,25 +265,15 @@ def _check_each(
 
 
 def _check_film(output: Path | None, vertices: Path | None, frames: int, fps: float) -> None:
-    if frames < 1:
-        raise typer.BadParameter(f"{frames} frames: give 1 or more", param_hint="--frames")
     if vertices is not None:
         raise typer.BadParameter(
             f"{vertices}: vertices have no film: leave out --frames", param_hint="--vertices"
         )
     if output is None:
-        raise typer.BadParameter(f"nothing to write: give -o FILM{FILM} or -o FOLDER", param_hint="-o")
-    if not 0.1 <= fps <= 1000:
-        raise typer.BadParameter(f"{fps} frames per second: give 0.1 to 1000", param_hint="--fps")
-    if not (_is_film(output) or output.is_dir() or output.suffix == ""):
         raise typer.BadParameter(
-            f"{output}: give a name that ends in {FILM}, or a folder without a dot in its name",
-            param_hint="-o",
+            f"nothing to write: give -o FILM{options.FILM} or -o FOLDER", param_hint="-o"
         )
-
-
-def _is_film(output: Path) -> bool:
-    return output.suffix.lower() == FILM and not output.is_dir()
+    options.check_film(output, frames, fps)
 
 
 def _check_suffix(path: Path | None, suffixes: tuple[str, ...], option: str, more: str = "") -> None:

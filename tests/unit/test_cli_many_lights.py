@@ -111,11 +111,11 @@ def test_a_film_of_a_lamp_that_moves(scene, tmp_path):
     [
         (["--frames", 3], "nothing moves"),
         (["--animate", "x=0:1"], "how many frames"),
-        (["--frames", 0, "--animate", "x=0:1"], "how many frames"),
+        (["--frames", 0, "--animate", "x=0:1"], "0 frames: give 1 or more"),
         (["--frames", 3, "--animate", "x=0"], "'x=0' is not NAME=FROM:TO"),
         (["--frames", 3, "--animate", "0:1"], "'0:1' is not NAME=FROM:TO"),
         (["--frames", 3, "--animate", "x=0:1", "--seconds", 3], "has --rows and --columns"),
-        (["--frames", 3, "--animate", "x=0:1", "--fps", 0], "not above 0"),
+        (["--frames", 3, "--animate", "x=0:1", "--fps", 1e-9], "give 0.1 to 1000"),
         (["--frames", 3, "--animate", "x=0:1", "-o", "a.png"], "ends in .mp4"),
     ],
 )
