@@ -15,12 +15,14 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 from mi_sparse_prt.core.morton import morton_order
 from mi_sparse_prt.core.sparse_product import multiply_sparse
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.neighbours import surface_neighbours
 from mi_sparse_prt.measurement.vertices import Points
 from mi_sparse_prt.reconstruction.interpolation_weights import linear_weights
@@ -235,7 +237,29 @@ def _least_risk(
     noise = np.maximum(smoothing.pooled(spread), np.float32(OWN) * spread)
 
     def risk(smooth: Floats, number: int) -> Floats:
-        found = (smooth - flat) ** 2 + (2 * smoothing.own[number][:, None] - 1) * noise
-        return np.ascontiguousarray(found.reshape(light.shape).sum(axis=2))
+        found = np.empty(light.shape[:2], np.float32)
+        counts = (2 * smoothing.own[number] - 1).astype(np.float32)
+        run_in_parts(_risks, len(light), smooth, flat, noise, counts, light.shape[2], found)
+        return found
 
     return smoothing.least(flat, risk), noise.reshape(light.shape)
+
+
+@numba.njit(nogil=True, cache=True)
+def _risks(
+    first: int,
+    last: int,
+    smooth: Floats,
+    light: Floats,
+    noise: Floats,
+    counts: Floats,
+    channels: int,
+    found: Floats,
+) -> None:
+    """What smoothing changed, squared, and as much of the noise as it counts, of all channels."""
+    for i in range(first, last):
+        for lamp in range(found.shape[1]):
+            total = np.float32(0)
+            for k in range(lamp * channels, (lamp + 1) * channels):
+                total += (smooth[i, k] - light[i, k]) ** 2 + counts[i] * noise[i, k]
+            found[i, lamp] = total

@@ -41,6 +41,7 @@ OPEN = 0.05  # of the area around a node, at least, on which photons arrive
 ALIKE = 1e-3  # normals
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
 
 
 class _Photons(NamedTuple):
@@ -106,37 +107,36 @@ class LightTracing:
             Mean (n, 3 * apart), and its variance as if one photon of the average power had arrived besides: infinite of
             nodes that have no surface of their own.
         """
-        sums, squares = (np.zeros((self._scene.n_vertices, 3 * self._apart)) for _ in "sq")
+        sums, squares = (np.zeros((self._alike.max() + 1, 3 * self._apart)) for _ in "sq")
         for met, vertex, power in self._arrivals(lamp, count, self._seeds[pilot]):
             place = 3 * (min(met, self._apart) - 1)
-            _count(vertex, power, place, sums, squares)
+            _count(self._alike, vertex, power, place, sums, squares)
         self.traced += count
         arrived = (float(squares.sum()) / max(float(sums.sum()), 1e-300)) ** 2  # of an average photon
-        area, uncertain = self._areas
-        mean = self._of_nodes(sums, 1) / area[:, None]
-        variance = (self._of_nodes(squares, 2) + arrived / 3) / area[:, None] ** 2
-        variance += uncertain[:, None] * np.square(mean)
-        closed = ~np.isfinite(area)
+        area, uncertain = (x.astype(np.float32)[:, None] for x in self._areas)
+        mean = self._of_nodes(sums, 1) / area
+        variance = (
+            self._of_nodes(squares, 2) + np.float32(arrived / 3)
+        ) / area / area + uncertain * mean * mean
+        closed = ~np.isfinite(area[:, 0])
         mean[closed], variance[closed] = 0, np.inf
-        return Estimate(mean.astype(np.float32), variance.astype(np.float32))
+        return Estimate(mean, variance)
 
-    def _of_nodes(self, values: Doubles, power: int) -> Doubles:
-        """Sums (n, k) at nodes of what arrived at vertices (n_v, k) and those alike, by weights to a power."""
-        together = [np.bincount(self._alike, column)[self._alike] for column in values.T]
-        values = np.stack(together, axis=1)
-        if self._weights is None:
-            return values
-        weights = self._weights if power == 1 else self._weights.power(power)
-        return multiply_sparse(weights, values.astype(np.float32)).astype(np.float64)
+    def _of_nodes(self, values: Doubles, power: int) -> Floats:
+        """Sums (n, k) at nodes of what arrived at vertices, those alike together (g, k), by weights to a power."""
+        if self._nodes.weights is None:
+            return values.astype(np.float32)[self._alike]
+        return multiply_sparse(self._weights[power], values.astype(np.float32))
 
     @cached_property
-    def _weights(self) -> scipy.sparse.csr_array | None:
-        """(n, n_v): which share of what arrives at vertices goes to nodes; None where all vertices are nodes."""
-        if self._nodes.weights is None:
-            return None
-        weights = self._nodes.weights.copy()
+    def _weights(self) -> dict[int, scipy.sparse.csr_array]:
+        """(n, g) by power: which share of what arrives at vertices, those alike together, goes to nodes; or squared."""
+        assert self._nodes.weights is not None
+        weights = scipy.sparse.csr_array(self._nodes.weights.T)
         weights.data = np.maximum(weights.data, 0)  # some are extrapolated, by next to nothing
-        return scipy.sparse.csr_array(weights.T)
+        n = len(self._alike)
+        together = scipy.sparse.csr_array((np.ones(n, np.float32), self._alike, np.arange(n + 1)))
+        return {power: weights.power(power) @ together for power in (1, 2)}
 
     @cached_property
     def _areas(self) -> tuple[Doubles, Doubles]:
@@ -157,7 +157,8 @@ class LightTracing:
             for vertex, sign in ((expected, -1), (found, 1)):
                 known = vertex != NOTHING
                 np.add.at(arrives, vertex[known], sign * area[known])
-        arrives, whole, tried = (self._of_nodes(x[:, None], 1)[:, 0] for x in (arrives, whole, tried))
+        together = (np.bincount(self._alike, x).astype(np.float64) for x in (arrives, whole, tried))
+        arrives, whole, tried = (self._of_nodes(x[:, None], 1)[:, 0].astype(np.float64) for x in together)
         share = arrives / np.maximum(whole, 1e-300)
         uncertain = np.maximum(1 - share, 0) / np.maximum(share * tried, 1e-30)
         return np.where(share > OPEN, np.pi * arrives, np.inf), uncertain
@@ -298,11 +299,17 @@ def _of_shading_normals(si: mi.SurfaceInteraction3f, local: mi.Vector3f, onwards
 
 @numba.njit(nogil=True, cache=True)
 def _count(
-    vertex: NDArray[np.uint32], power: NDArray[np.float32], place: int, sums: Doubles, squares: Doubles
+    alike: NDArray[np.int64],
+    vertex: NDArray[np.uint32],
+    power: NDArray[np.float32],
+    place: int,
+    sums: Doubles,
+    squares: Doubles,
 ) -> None:
-    """Add up what arrives at vertices, in three columns from ``place`` on, and its squares."""
+    """Add up what arrives at vertices, those alike together, in three columns from ``place`` on, and its squares."""
     for i in range(len(vertex)):
+        row = alike[vertex[i]]
         for c in range(3):
             own = np.float64(power[c, i])
-            sums[vertex[i], place + c] += own
-            squares[vertex[i], place + c] += own * own
+            sums[row, place + c] += own
+            squares[row, place + c] += own * own
