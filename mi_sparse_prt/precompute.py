@@ -276,7 +276,8 @@ class _Attempts:
                 break
             if self._run.progress:
                 tqdm.write(_again(found.total, proposals.plan, proposals.seconds))
-            attempts.append(self._execution.parts(proposals.plan))
+            kept = attempts[-1] if proposals.keeps_indirect else None
+            attempts.append(self._execution.parts(proposals.plan, kept))
             plans.append(proposals.plan)
         best = int(np.argmin([math.inf if found is None else found.total for found in judged]))
         return self._finished(attempts, best, judged[best]), plans[best]

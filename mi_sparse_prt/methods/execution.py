@@ -75,13 +75,22 @@ class Execution:
             self._specular = specular.take(rows_among(self._problem.reflection, sent.every))
             self._sent = specular.take(rows_among(sent.reflection, sent.every))
 
-    def parts(self, plan: Plan) -> MethodResult:
-        """The parts of the matrix, and an account of what was evaluated for them by this call."""
+    def parts(self, plan: Plan, kept: MethodResult | None = None) -> MethodResult:
+        """The parts of the matrix, and an account of what was evaluated for them by this call.
+
+        Parameters
+        ----------
+        plan : Plan
+        kept : MethodResult, optional
+            Whose indirect light is taken, in place of that of the plan.
+        """
         if plan.direct in TOGETHER:
             return self._with_specular(self._together(plan))
         light = self._with_specular(self.direct_light(plan))
         if plan.indirect == "none" or not self._any_indirect:
             return light
+        if kept is not None:
+            return replace(light, indirect=kept.indirect, skipped=kept.skipped, radiosity=kept.radiosity)
         return self._gathered(plan, light) if plan.indirect == "gather" else self._path_traced(plan, light)
 
     def _with_specular(self, light: MethodResult) -> MethodResult:

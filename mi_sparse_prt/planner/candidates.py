@@ -25,7 +25,7 @@ from mi_sparse_prt.planner.choice import (
     with_direct,
 )
 from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN
-from mi_sparse_prt.planner.texel_shares import TexelShares
+from mi_sparse_prt.planner.texel_shares import HALF, TexelShares
 from mi_sparse_prt.solvers.adaptive_strata import Strata
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -56,11 +56,14 @@ class RefinementSchedule:
         The present one.
     seconds : float or None
         What it is predicted to take; where others came before, beside these.
+    keeps_indirect : bool
+        Whether indirect light of the attempt before is to be kept: the present plan finds direct light alone.
     too_long : None
         See ``CandidatePlans``.
     """
 
     seconds: float | None = None
+    keeps_indirect: bool = False
     too_long: Predicted | None = None
 
     def __init__(
@@ -81,8 +84,13 @@ class RefinementSchedule:
         """Go on to the next plan, the present one having this error after so many seconds; False if none is left.
 
         More rays make light more exact that is gathered, and no other; of that, what comes ``of_rays``, where it is
-        known.
+        known. Where finer direct light is predicted to be enough, indirect light stays as it is.
         """
+        finer = self._with_finer_light(found)
+        self.keeps_indirect = finer is not None
+        if finer is not None:
+            self.plan, self._error = finer, math.inf  # what rays do is not known from that
+            return True
         if not self._others:
             return False
         before = self.plan
@@ -115,6 +123,14 @@ class RefinementSchedule:
         if _light(self.plan) != _light(following):  # finer direct light comes as near as the plan's tolerance
             square -= max(found.parts["direct"] ** 2 - following.tolerance**2, 0.0)
         return math.sqrt(max(square, 0.0))
+
+    def _with_finer_light(self, found: HeldOutError) -> Plan | None:
+        """The present plan with finer direct light, if that is enough for the target."""
+        finer = self._with_shares(self.plan)
+        if not self._aim or _light(finer) == _light(self.plan):
+            return None
+        less = max(found.parts["direct"] ** 2 - (HALF * self._aim) ** 2, 0.0)
+        return finer if found.total**2 - less <= self._aim**2 else None
 
     def _with_shares(self, plan: Plan) -> Plan:
         return plan if self._shares is None else self._shares.of(plan)
@@ -150,6 +166,7 @@ class CandidatePlans:
     quickest one is the present one. Where next to no light arrives, the quickest one is good enough.
     """
 
+    keeps_indirect = False
     too_long: Predicted | None = None
 
     def __init__(self, costs: Costs, settings: Settings) -> None:

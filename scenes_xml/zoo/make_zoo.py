@@ -189,6 +189,13 @@ BSDFS = {
     <float name="clearcoat" value="0.5"/>
 </bsdf>"""
     ),
+    "principled_lacquer": ball(
+        """<bsdf type="principled">
+    <rgb name="base_color" value="0.4, 0.05, 0.05"/>
+    <float name="roughness" value="0.02"/>
+    <float name="specular" value="0.6"/>
+</bsdf>"""
+    ),
     "principled_textured": ball(
         """<bsdf type="principled">
     <texture name="base_color" type="bitmap">
