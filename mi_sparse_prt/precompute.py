@@ -31,7 +31,7 @@ from mi_sparse_prt.methods.result import MethodResult
 from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
 from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted
-from mi_sparse_prt.planner.forecast import Forecast, fits, forecast
+from mi_sparse_prt.planner.forecast import Forecast, beside_direct_light, fits, forecast
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.specular_steps import SpecularSteps
 from mi_sparse_prt.reconstruction.senders import choose_senders
@@ -231,8 +231,17 @@ class _Attempts:
 
     def _forecast(self) -> Forecast:
         with self._run.clock.phase("pilot"):
-            proposals, indirect = self._proposals, self._dark is None
-            return forecast(self._direct, self._settings, proposals.plan, indirect, proposals.seconds)
+            proposals, indirect, plan = self._proposals, self._dark is None, self._proposals.plan
+            expected = forecast(self._direct, self._settings, plan, indirect, proposals.seconds)
+            if self._settings.method != "auto" or expected.seconds <= self._settings.max_seconds:
+                return expected
+            # a few rows of another kind are not enough to refuse a scene by
+            light = proposals.direct_seconds()
+            return (
+                expected
+                if light is None
+                else expected._replace(seconds=beside_direct_light(light, plan, indirect))
+            )
 
     def _fits(self, plan: Plan) -> bool:
         """Whether there is memory for one more attempt; if not, the report will say so."""

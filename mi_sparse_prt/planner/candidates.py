@@ -124,6 +124,12 @@ class RefinementSchedule:
             square -= max(found.parts["direct"] ** 2 - following.tolerance**2, 0.0)
         return math.sqrt(max(square, 0.0))
 
+    def direct_seconds(self) -> float | None:
+        """What direct light of the present plan takes, if it can be measured at a few points."""
+        return (
+            None if self._shares is None or self.plan.direct == "exact" else self._shares.seconds(self.plan)
+        )
+
     def _with_finer_light(self, found: HeldOutError) -> Plan | None:
         """The present plan with finer direct light, if that is enough for the target."""
         finer = self._with_shares(self.plan)
@@ -248,6 +254,9 @@ class CandidatePlans:
         self._plans.append(next_one)
         self._tried.append(next_one)
         return True
+
+    def direct_seconds(self) -> None:
+        """Not asked for: all seconds are predicted."""
 
     def leave(self) -> None:
         """Do not carry out the present plan, after others."""

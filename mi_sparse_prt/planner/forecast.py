@@ -85,6 +85,12 @@ def forecast(
     return Forecast(seconds, float(needed))
 
 
+def beside_direct_light(seconds: float, plan: Plan, indirect: bool) -> float:
+    """Seconds of a matrix whose direct light takes so many: that rays are slow which pass leaves slows no others."""
+    light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
+    return seconds * (light.rays + more.rays) / light.rays
+
+
 def fits(direct: DirectSolver, settings: Settings, plan: Plan, indirect: bool) -> bool:
     """Whether there is memory for one more plan, beside what is known of those before; arguments as of ``forecast``."""
     paths = indirect_solver(direct.problem, settings.of(plan))

@@ -1,6 +1,7 @@
 """Where no plan is predicted, of glossy surfaces and of pixels, strata are adaptive where edges would miss."""
 
 import math
+import time
 import warnings
 from dataclasses import replace
 
@@ -206,3 +207,42 @@ def test_indirect_light_is_kept(monkeypatch):
     errors = [transport.report["estimated_error"] for transport in found]
     print(*(f"{e['total']:.1%} ({e['parts']})" for e in errors))
     assert errors[1]["total"] < 0.08
+
+
+def test_a_scene_is_refused_by_what_was_measured(monkeypatch):
+    """
+    Rationale: a cabin among trees was refused, 322 s by a few rows of other rays; its matrix took less.
+    Expected: where such rows forecast hours, direct light itself is timed, and the scene is not refused, though told
+        what it takes; it is where that takes hours as well.
+    """
+    scene = slatted(0.4, METAL)
+    monkeypatch.setattr("mi_sparse_prt.planner.forecast.seconds_per_row", lambda _: 100.0)
+    options = {"basis": "texel", "target_error": 0.2, "terms": 6, "progress": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = prt.precompute(scene, LIGHTING, **options).report
+        assert found["forecast"]["seconds"] < 60 < 100 * scene.n_vertices
+        monkeypatch.setattr(TexelShares, "seconds", lambda *_: 1e4)
+        with pytest.raises(prt.PrtError, match=r"would take about \d+ s, more than max_seconds=300"):
+            prt.precompute(scene, LIGHTING, **options)
+    monkeypatch.undo()
+
+
+def test_edges_are_timed_at_a_few_points(monkeypatch):
+    """
+    Expected: of edges, the second time that those of a pilot's points are found, for as many times as there are points;
+        of strata, what the pilot has told.
+    """
+    calls = []
+
+    def slow(*_) -> float:
+        calls.append(time.sleep(0.2 if calls else 0.6))  # the first one compiles
+        return 1.0
+
+    monkeypatch.setattr("mi_sparse_prt.planner.texel_shares.edges_error", slow)
+    direct = DirectSolver(problem_at(slatted(0.4, METAL), LIGHTING, basis="texel"))
+    shares, plan = TexelShares(direct, settings(target_error=0.05)), Plan("edges", "gather", 64, 0.06)
+    each = shares.seconds(plan) / len(direct.points) * len(shares._held.vertices)
+    assert len(calls) == 2 and 0.2 <= each < 0.5
+    finer = shares.of(plan)
+    assert finer.direct == "adaptive" and shares.seconds(finer) == next(iter(shares._costs.values())).seconds
