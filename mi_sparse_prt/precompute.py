@@ -235,13 +235,11 @@ class _Attempts:
             expected = forecast(self._direct, self._settings, plan, indirect, proposals.seconds)
             if self._settings.method != "auto" or expected.seconds <= self._settings.max_seconds:
                 return expected
-            # a few rows of another kind are not enough to refuse a scene by
+            # rows of another kind than the plan's are not enough to refuse a scene by
             light = proposals.direct_seconds()
-            return (
-                expected
-                if light is None
-                else expected._replace(seconds=beside_direct_light(light, plan, indirect))
-            )
+            if light is None:
+                return expected
+            return expected._replace(seconds=beside_direct_light(light, plan, indirect))
 
     def _fits(self, plan: Plan) -> bool:
         """Whether there is memory for one more attempt; if not, the report will say so."""

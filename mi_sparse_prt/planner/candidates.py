@@ -86,7 +86,7 @@ class RefinementSchedule:
         More rays make light more exact that is gathered, and no other; of that, what comes ``of_rays``, where it is
         known. Where finer direct light is predicted to be enough, indirect light stays as it is.
         """
-        finer = self._with_finer_light(found)
+        finer = self._with_finer_light(found, elapsed)
         self.keeps_indirect = finer is not None
         if finer is not None:
             self.plan, self._error = finer, math.inf  # what rays do is not known from that
@@ -126,17 +126,18 @@ class RefinementSchedule:
 
     def direct_seconds(self) -> float | None:
         """What direct light of the present plan takes, if it can be measured at a few points."""
-        return (
-            None if self._shares is None or self.plan.direct == "exact" else self._shares.seconds(self.plan)
-        )
+        if self._shares is None or self.plan.direct not in ("edges", "adaptive"):
+            return None
+        return self._shares.seconds(self.plan)
 
-    def _with_finer_light(self, found: HeldOutError) -> Plan | None:
-        """The present plan with finer direct light, if that is enough for the target."""
+    def _with_finer_light(self, found: HeldOutError, elapsed: float) -> Plan | None:
+        """The present plan with finer direct light, if that is enough for the target and there is time for it."""
         finer = self._with_shares(self.plan)
-        if not self._aim or _light(finer) == _light(self.plan):
+        if not self._aim or self._shares is None or _light(finer) == _light(self.plan):
             return None
         less = max(found.parts["direct"] ** 2 - (HALF * self._aim) ** 2, 0.0)
-        return finer if found.total**2 - less <= self._aim**2 else None
+        enough = found.total**2 - less <= self._aim**2
+        return finer if enough and elapsed + self._shares.seconds(finer) <= self._limit else None
 
     def _with_shares(self, plan: Plan) -> Plan:
         return plan if self._shares is None else self._shares.of(plan)

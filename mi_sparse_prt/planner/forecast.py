@@ -86,7 +86,7 @@ def forecast(
 
 
 def beside_direct_light(seconds: float, plan: Plan, indirect: bool) -> float:
-    """Seconds of a matrix whose direct light takes so many: that rays are slow which pass leaves slows no others."""
+    """Seconds of a matrix whose direct light takes so many, the rest in the same proportion as in ``forecast``."""
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
     return seconds * (light.rays + more.rays) / light.rays
 

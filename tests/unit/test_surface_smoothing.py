@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from conftest import T, build, diffuse
 
+from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.measurement.vertices import vertex_points
-from mi_sparse_prt.reconstruction.surface_smoothing import smooth_light, smoothing_levels
+from mi_sparse_prt.reconstruction.surface_smoothing import _risks, smooth_light, smoothing_levels
 
 
 def _room(**others):
@@ -103,3 +104,15 @@ def test_noisy_peaks_keep_their_light(scene, levels):
     print(f"{np.mean(off):.2%} +- {np.std(off) / 8:.2%}")
     assert abs(np.mean(off)) < 0.02
     assert np.std(off) / 8 < 0.005
+
+
+def test_risk_is_steins_estimate():
+    """
+    Expected: |S x - x|^2 + (2 S_ii - 1) s^2 of all channels of each lamp, as NumPy has it, to rounding.
+    """
+    rng = np.random.default_rng(5)
+    smooth, light, noise = (rng.random((50, 12), np.float32) for _ in "xyz")
+    counts, found = 2 * rng.random(50, np.float32) - 1, np.empty((50, 4), np.float32)
+    run_in_parts(_risks, 50, smooth, light, noise, counts, 3, found)
+    expected = ((smooth - light) ** 2 + counts[:, None] * noise).reshape(50, 4, 3).sum(axis=2)
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-6)

@@ -159,13 +159,17 @@ def test_direct_light_is_found_again_without_the_rest():
     """
     Rationale: jewellery missed 5% by what edges do not see alone, and all of its light was found again.
     Expected: the same rays, and indirect light that is kept, where finer direct light is predicted to meet the target;
-        the next plan, with light of its own, where it is not, and after that attempt, whatever its error was.
+        the next plan, with light of its own, where it is not, and after that attempt, whatever its error was. Neither
+        if there is no time for it.
     """
 
     class Shares:
         def of(self, plan: Plan, share: float = HALF) -> Plan:
             fine = replace(plan, direct="adaptive", strata=Strata(2, 4))
             return plan if share == FIRST_SHARE or plan.direct == "adaptive" else fine
+
+        def seconds(self, plan: Plan) -> float:
+            return 5.0
 
     def found(direct: float, indirect: float) -> HeldOutError:
         parts = {"direct": direct, "indirect": indirect}
@@ -180,6 +184,8 @@ def test_direct_light_is_found_again_without_the_rest():
     far = RefinementSchedule(plans, shares=Shares(), target=0.05)
     assert far.after(found(0.055, 0.06), 4.0)
     assert (far.plan.direct, far.plan.rays, far.keeps_indirect) == ("adaptive", 256, False)
+    late = RefinementSchedule(plans, limit=8.0, shares=Shares(), target=0.05)
+    assert not late.after(found(0.055, 0.025), 4.0) and late.plan == plans[0]
 
 
 def test_indirect_light_is_kept(monkeypatch):
