@@ -197,7 +197,7 @@ class _Attempts:
         if self._dark is None and self._problem.specular_apart:
             others = _predicted_error(settings, costs)
             with run.clock.phase("specular"):
-                self._specular = SpecularSteps(self._problem, settings, run.seed, others)
+                self._specular = SpecularSteps(self._problem, settings, run.seed, others, self._time_left())
             costs = None if costs is None else _beside_specular(costs, self._specular)
         noise, light = (0.0, None) if self._specular is None else (self._specular.error, self._specular.every)
         self._proposals = _proposals(direct, settings, costs, noise, run.clock)
@@ -228,6 +228,11 @@ class _Attempts:
             | _inputs(problem, self._settings.of(plan))
         )
         return transport
+
+    def _time_left(self) -> float:
+        """Seconds that ``"auto"`` may still take."""
+        limit = self._settings.max_seconds if self._settings.method == "auto" else math.inf
+        return limit - self._run.clock.report()["total"]
 
     def _forecast(self) -> Forecast:
         with self._run.clock.phase("pilot"):
@@ -309,7 +314,7 @@ class _Attempts:
             return parts
         found = found or self._judged(parts, len(attempts), TARGET)
         with self._run.clock.phase("specular"):
-            self._specular.refine(found)
+            self._specular.refine(found, self._time_left())
             light = self._specular.light
         return replace(parts, specular=light, rays=parts.rays | {"specular": light.rays})
 

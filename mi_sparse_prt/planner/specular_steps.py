@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 from mi_sparse_prt.core.bits import Bits
@@ -35,16 +36,25 @@ class SpecularSteps:
     seed : int
     others : float
         Error of all other light, as predicted: noise that does not matter beside it need not be found out.
+    seconds : float
+        As a source it may take half of these: what noise is left then is told.
     """
 
-    def __init__(self, problem: Problem, settings: Settings, seed: int, others: float = 0.0) -> None:
+    def __init__(
+        self, problem: Problem, settings: Settings, seed: int, others: float = 0.0, seconds: float = math.inf
+    ) -> None:
+        end = time.perf_counter() + seconds / 2
         self._aim, self._target = settings.specular.error, settings.target_error
         self._own = settings.specular_error
         averaging = None
         if problem.scene.bends_light and problem.at_vertices is problem:
             averaging = SpecularNoise(problem, seed)
-        self._search = SpecularSearch(problem, seed, settings.specular, averaging=averaging)
-        self._search.refine(AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0)
+        self._search = SpecularSearch(
+            problem, seed, settings.specular, averaging=averaging, seconds=seconds / 4
+        )
+        self._enough = self._search.refine(
+            AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0, end - time.perf_counter()
+        )
         self._problem, every = problem, None if problem.sent is None else problem.sent.every
         has_terms = bool(every or problem.reflection.terms)
         self._terms = term_rows(problem, seed, self._search.passed, every) if has_terms else None
@@ -68,8 +78,13 @@ class SpecularSteps:
 
     @property
     def error(self) -> float:
-        """What its noise will be if other light has smaller errors, as a part of the error of all."""
-        return 0.0 if self._own else min(self._aim, self._search.error)
+        """What its noise will be if other light has smaller errors, as a part of the error of all.
+
+        What takes too long as a source is not begun again.
+        """
+        return (
+            0.0 if self._own else min(self._aim, self._search.error) if self._enough else self._search.error
+        )
 
     @property
     def most(self) -> bool:
@@ -78,8 +93,8 @@ class SpecularSteps:
 
     @property
     def done(self) -> bool:
-        """Whether there is no more noise than is aimed at, or enough."""
-        return self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)
+        """Whether there is no more noise than is aimed at, or enough, or as much as time does not take away."""
+        return not self._enough or self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)
 
     def foreseen(self, found: HeldOutError) -> HeldOutError:
         """Errors of a matrix with this light, found now, as they will be with ``error``: those that a target is for."""
@@ -88,14 +103,14 @@ class SpecularSteps:
         total = math.sqrt(max(found.total**2 - now**2 + after**2, 0.0))
         return replace(found, total=total, parts=found.parts | {"specular": after})
 
-    def refine(self, found: HeldOutError) -> None:
-        """Take the noise away that matters beside errors that are known to stay, or to a target.
+    def refine(self, found: HeldOutError, seconds: float = math.inf) -> None:
+        """Take the noise away that matters beside errors that are known to stay, or to a target, in so many seconds.
 
         It may be as large as makes the error a tenth larger, or as the target leaves room for, or as is enough.
         """
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
-        self._search.refine(max(self._aim, _worth(others), room), self._own or 0.0)
+        self._search.refine(max(self._aim, _worth(others), room), self._own or 0.0, seconds)
 
 
 def _worth(others: float) -> float:

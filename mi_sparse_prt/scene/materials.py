@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from copy import copy
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -34,6 +35,9 @@ FLAT_TEXTURES = {"BitmapTexture", "Checkerboard"}
 
 #: BSDFs that bend the shading normal of the one that they wrap.
 BUMPED = {"NormalMap", "BumpMap"}
+
+ANGLES = 64  # at which it is looked up what panes let through
+DIMMED = 0.99  # of the light, at most: rounding makes no difference to what is lost
 
 _LAMP = Fact(
     " is an area emitter: matrices of lamps (SceneEmitters) have its light, those of a cubemap do not",
@@ -182,6 +186,19 @@ class Material:
         textured = self._radiance is not None and self._radiance.is_spatially_varying()
         self.textured = bool(self._classes & FLAT_TEXTURES)
         self.constant = self._classes <= PLAIN and not textured
+
+    @cached_property
+    def dims(self) -> bool:
+        """Whether light that goes straight through certainly loses some of itself, wherever it does: thin panes."""
+        kind = bsdf_class(self.bsdf)
+        of_one_opacity = kind == "MaskBSDF" and "opacity.value" in mi.traverse(self.bsdf)
+        if not (of_one_opacity or (kind == "ThinDielectric" and self._classes <= PLAIN | {"ThinDielectric"})):
+            return False
+        si = dr.zeros(mi.SurfaceInteraction3f, 2 * ANGLES)
+        cosine = (dr.arange(mi.Float, 2 * ANGLES) + 0.5) / ANGLES - 1
+        si.wi = mi.Vector3f(dr.sqrt(1 - cosine * cosine), 0, cosine)
+        through = mi.Color3f(self.bsdf.eval_null_transmission(si))
+        return bool(np.max(np.array(dr.sum(through) / 3)) < DIMMED)
 
     @property
     def shines(self) -> bool:

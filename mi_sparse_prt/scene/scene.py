@@ -392,6 +392,11 @@ class Scene:
         """Those of ``unsplit`` that no light goes straight through."""
         return self._unsplit_surfaces(lambda material: not material.passes_straight)
 
+    @cached_property
+    def dimming_surfaces(self) -> TracedScene | None:
+        """Those of ``unsplit`` past which no light is as it was: ``blocking_surfaces``, and panes."""
+        return self._unsplit_surfaces(lambda material: not material.passes_straight or material.dims)
+
     def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> TracedScene | None:
         """A scene of some surfaces of ``unsplit``, in the normalised frame; None for none."""
         which = [k for k, run in enumerate(self._runs) if belongs(self.materials[run.start])]

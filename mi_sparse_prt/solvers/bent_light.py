@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numba
 import numpy as np
 import scipy.sparse
@@ -12,7 +14,15 @@ from mi_sparse_prt.core.sparse_arrays import sparse_of_rows
 from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.refined_mean import Averaging, Doubles, Estimate, RefinedMean, Round, compared
+from mi_sparse_prt.solvers.refined_mean import (
+    Averaging,
+    Doubles,
+    Estimate,
+    RefinedMean,
+    Round,
+    Timed,
+    compared,
+)
 from mi_sparse_prt.solvers.specular_chains import (
     CELLS,
     LANES,
@@ -76,10 +86,13 @@ class BentLight:
         each = np.clip(FEWEST / max(len(shares), 1), first**2, max(first, 1) ** 2)
         begun = self._sampled(each * shares, most)
 
-        def sample(wanted: float) -> Round:
+        def sample(wanted: float, affordable: float) -> Round | None:
+            before = self._moments.traced
+            if affordable < SHRINKING * before:
+                return None
             rays = self._moments.best_rays(wanted)
-            before, all_rays = self._moments.traced, max(2 * float(rays.sum()), 1e-30)
-            rays *= np.clip(1, SHRINKING * before / all_rays, GROWTH * before / all_rays)
+            all_rays = max(2 * float(rays.sum()), 1e-30)
+            rays *= np.clip(1, SHRINKING * before / all_rays, min(GROWTH * before, affordable) / all_rays)
             rays = np.minimum(rays, float(most**2))
             expected = self._moments.foreseen(rays)
             return Round(self._sampled(rays, most), expected, bool((rays == most**2).all()))
@@ -88,7 +101,7 @@ class BentLight:
 
     def _sampled(self, rays: Doubles, most: int) -> Estimate:
         """Light from so many rays into each cell, about, twice."""
-        halves, traced = [], 0
+        halves, traced, begin = [], 0, time.perf_counter()
         for _ in "ab":
             seed = next(self._seeds)
             strata = draw_strata(self._cells, self._keys, rays, most, seed)
@@ -98,7 +111,7 @@ class BentLight:
             traced += int((strata.across**2).sum())
         total = compared(halves, self._power, traced)
         self._moments.calibrate(total.noise, rays)
-        return total
+        return total._replace(timed=Timed(time.perf_counter() - begin, traced))
 
     def _light(self, strata: Strata, seed: int) -> tuple[list[Sparse], NDArray[np.float32]]:
         """Light (points, texels) of each channel, for some points at a time."""

@@ -255,7 +255,8 @@ class DirectSolver:
         active &= cosine > 0
         ray = start_ray(self._points, point, direction)
         if self.problem.specular_apart and self.problem.scene.passes_straight:
-            return active & self._transmittance(ray, active).whole, cosine
+            active = _unblocked(self.problem.scene.dimming_surfaces, ray, active)
+            return active & self._passed(ray, active).whole, cosine
         return active & ~self.scene.ray_test(ray, active=active), cosine
 
     def partly_passed(
@@ -302,15 +303,13 @@ class DirectSolver:
         return [dr.select(passed.surfaces == k + 1, value, 0) for k in range(depths)] if depths else [value]
 
     def _transmittance(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:
-        """Light that comes straight through surfaces, each of which counts as a bounce.
+        """Light that comes straight through surfaces, each of which counts as a bounce."""
+        return self._passed(ray, _unblocked(self.problem.scene.blocking_surfaces, ray, active))
 
-        Where others are in the way is found first: to ask whether anything is takes a third of the time of what.
-        """
+    def _passed(self, ray: mi.Ray3f, active: mi.Mask) -> _Passed:
+        """Light that surfaces let through which let some of it through."""
         scene, depth, apart = self.problem.scene, self.problem.max_depth, self.problem.depths_apart > 0
         most = dr.opaque(mi.UInt32, depth - 2 if depth >= 0 else 1 << 30)
-        if scene.blocking_surfaces is not None:
-            active = active & ~scene.blocking_surfaces.ray_test(ray, active)
-            dr.eval(active)  # a kernel on a GPU traces rays in one scene only
         share, count, boundary = pass_straight(
             scene.passing_surfaces,
             ray,
@@ -367,6 +366,15 @@ class DirectSolver:
         v = (mi.Float(row) + rng.next_float32()) / self.strata
         direction, area = self._texels.inside(texel, u, v)
         return direction, area, dr.block_reduce(dr.ReduceOp.Add, area, self.rays_per_element)
+
+
+def _unblocked(scene: TracedScene | None, ray: mi.Ray3f, active: mi.Mask) -> mi.Mask:
+    """Rays that meet no surface of some that need not be told apart: to ask for any takes a third of the time."""
+    if scene is None:
+        return active
+    active = active & ~scene.ray_test(ray, active)
+    dr.eval(active)  # a kernel on a GPU traces rays in one scene only
+    return active
 
 
 @dr.syntax

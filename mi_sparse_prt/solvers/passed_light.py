@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import replace
 
 import numba
@@ -14,7 +16,7 @@ from mi_sparse_prt.core.threads import run_in_parts
 from mi_sparse_prt.operators.operator import Ids
 from mi_sparse_prt.solvers.direct_rays import DirectSolver, PassedLight
 from mi_sparse_prt.solvers.problem import Problem
-from mi_sparse_prt.solvers.refined_mean import Doubles, Estimate, RefinedMean, Round, compared
+from mi_sparse_prt.solvers.refined_mean import Doubles, Estimate, RefinedMean, Round, Timed, compared
 from mi_sparse_prt.solvers.specular_chains import LANES, Sparse
 
 Floats = NDArray[np.float32]
@@ -22,6 +24,7 @@ Floats = NDArray[np.float32]
 STRATA = 1, 2, 3, 4, 8  # per axis of a texel
 FIRST = 2  # strata per axis at edges: with one, noise is seven times as large for a quarter of the rays
 ALIKE = 0.1  # as a share: what neighbouring texels let through may differ by so much without an edge
+FEWER = 0.9  # times the strata per axis, until their rays are no more than there is time for
 FINE = 16  # texels along an edge of a face, or rays in their place: panes that are smaller are missed
 
 
@@ -30,7 +33,7 @@ class PassingLight:
 
     def __init__(self, problem: Problem, ids: Ids, power: Doubles, seeds: list[int]) -> None:
         self._problem, self._ids, self._power, self._seeds = problem, ids, power, iter(seeds)
-        strata = max(1, FINE // problem.emission.resolution)
+        strata, begin = max(1, FINE // problem.emission.resolution), time.perf_counter()
         #: Which points see the centres of texels, where rays are at these.
         self.seen: Bits | None = None
         if problem.basis == "direction" or strata == 1:
@@ -38,29 +41,39 @@ class PassingLight:
         else:
             self._found = _passed_light(DirectSolver(problem, strata, next(self._seeds)), ids)
         self._rays = len(ids) * problem.emission.size * (strata**2 if self.seen is None else 1)
+        self._timed = Timed(time.perf_counter() - begin, self._rays)
         self._rows, self._texels = _with_neighbours(self._found, problem)
 
-    def estimated(self, across: int | None = None) -> RefinedMean:
+    def estimated(self, across: int | None = None, seconds: float = math.inf) -> RefinedMean:
         """So many strata per axis of a texel, or as many as the noise asks for; none in the direction basis.
 
         Squared noise of strata falls as strata**-3 at the edges of light. With as many rays in all as strata**2 it is
         least where strata are in proportion to the fifth root of each texel's own, which two first halves tell,
-        averaged with those of its neighbours. These begin with one ray where centres of texels tell of no edge.
+        averaged with those of its neighbours. These begin with one ray where centres of texels tell of no edge, or
+        where more would take longer than so many seconds, about.
         """
         if self._problem.basis == "direction":
             return RefinedMean(compared([[self._found]] * 2, self._power, self._rays))
         strata = np.full(len(self._rows), across or FIRST)
         if across is None and self.seen is not None:
             strata[self._without_edges()] = 1
+        if across is None and _rays_of(strata) > self._timed.rays_in(seconds):
+            strata[:] = 1
         first, squares = self._sampled(strata)
         if across is not None or not len(squares):
             return RefinedMean(first)
         law = self._averaged(squares * strata**3.0)
-        between = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:])
+        between, own = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:]), law**0.2
 
-        def sample(wanted: float) -> Round:
+        def strata_of(scale: float) -> NDArray[np.int64]:
+            return np.array(STRATA)[np.searchsorted(between, scale * own)]
+
+        def sample(wanted: float, affordable: float) -> Round | None:
+            if affordable < 2 * len(law):
+                return None
             scale = (float((law**0.4).sum()) / wanted) ** (1 / 3)
-            strata = np.array(STRATA)[np.searchsorted(between, scale * law**0.2)]
+            while _rays_of(strata := strata_of(scale)) > affordable:
+                scale *= FEWER
             expected = float((law / strata**3.0).sum())
             return Round(self._sampled(strata)[0], expected, bool((strata == STRATA[-1]).all()))
 
@@ -90,7 +103,7 @@ class PassingLight:
 
     def _sampled(self, strata: NDArray[np.int64]) -> tuple[Estimate, Doubles]:
         """Light through strata of each texel, twice; and the squared noise of each element."""
-        depths, shape = max(self._problem.depths_apart, 1), self._found.shape
+        depths, shape, begin = max(self._problem.depths_apart, 1), self._found.shape, time.perf_counter()
         values = [np.zeros((len(strata), depths), np.float32) for _ in "ab"]
         for own in np.unique(strata):
             which = np.flatnonzero(strata == own)
@@ -104,9 +117,16 @@ class PassingLight:
         halves = [
             [_side_by_side(PassedLight(every, half), self._rows, self._texels, shape)] for half in values
         ]
-        traced, self._rays = self._rays + 2 * int((strata**2).sum()), 0
+        before, self._rays, rays = self._rays, 0, _rays_of(strata)
+        self._timed = Timed(time.perf_counter() - begin, rays)
         spread = np.square(values[0] - values[1], dtype=np.float64).sum(axis=1) / 4
-        return compared(halves, self._power, traced), spread * self._power.max(axis=1)[self._rows]
+        found = compared(halves, self._power, before + rays)._replace(timed=self._timed)
+        return found, spread * self._power.max(axis=1)[self._rows]
+
+
+def _rays_of(strata: NDArray[np.int64]) -> int:
+    """Of two halves, of so many strata per axis of each texel."""
+    return 2 * int(np.square(strata).sum())
 
 
 def _side_by_side(passed: PassedLight, rows: Ids, texels: Ids, shape: tuple[int, int]) -> Sparse:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -37,13 +39,28 @@ class Limit(NamedTuple):
         return max(self.share * square + self.number, self.alone * square)
 
 
+class Timed(NamedTuple):
+    """Seconds that so many rays took."""
+
+    seconds: float
+    rays: int
+
+    def rays_in(self, seconds: float) -> float:
+        """How many rays a time is enough for."""
+        return seconds * self.rays / self.seconds if self.seconds > 0 else math.inf
+
+
 class Estimate(NamedTuple):
-    """Two halves, of one channel for all or of three; squared norm of radiance, squared noise of the mean, and rays."""
+    """Two halves, of one channel for all or of three; squared norm of radiance, squared noise of the mean, and rays.
+
+    With the seconds that its last rays took, and how many these are, where time can be limited.
+    """
 
     halves: list[list[Sparse]]
     square: float
     noise: float
     rays: int
+    timed: Timed = Timed(0.0, 0)
 
 
 class Round(NamedTuple):
@@ -65,7 +82,8 @@ class RefinedMean:
     total : Estimate
         The first.
     sample : callable, optional
-        Another estimate, of as much squared noise as it is asked for, about; None if the first is as fine as can be.
+        Another estimate, of as much squared noise as it is asked for, about, but of no more rays than are given, or
+        None if these are too few; None in its place if the first is as fine as can be.
     power : (n, 3) float64, optional
         What the squares of each row count.
     averaging : Averaging, optional
@@ -79,7 +97,7 @@ class RefinedMean:
     def __init__(
         self,
         total: Estimate,
-        sample: Callable[[float], Round] | None = None,
+        sample: Callable[[float, float], Round | None] | None = None,
         power: Doubles | None = None,
         averaging: Averaging | None = None,
     ) -> None:
@@ -95,20 +113,28 @@ class RefinedMean:
                 max(self._averaging.judge(halves, _power_of(halves, self._power)), 0), total.noise
             )
 
-    def refine(self, limit: Limit) -> None:
-        """Add estimates until the noise is small enough."""
+    def refine(self, limit: Limit, seconds: float = math.inf) -> bool:
+        """Add estimates until the noise is small enough, for no more than about so many seconds.
+
+        Returns whether these were enough.
+        """
+        end = time.perf_counter() + seconds
         for _ in range(ROUNDS):
             bound, before = max(limit.of(self.total.square), 1e-30), self.total.noise
             if self._sample is None or self.noise <= self._enough * bound:
                 break
             # its mean with what there is has as much as is wanted, of which the same share is left
-            more = self._sample(before * bound / (self.noise - bound))
+            rays = self.total.timed.rays_in(end - time.perf_counter())
+            more = self._sample(before * bound / (self.noise - bound), rays)
+            if more is None:
+                return False
             share = self._expected / max(self._expected + more.expected, 1e-300)
             self._expected = share * more.expected
             self._take(_mean_of(self.total, more.found, share))
             self._enough = ENOUGH
             if more.finest:
                 self._sample = None
+        return True
 
     def mean(self) -> list[Sparse]:
         """Light of both halves together, of as many channels as these have."""
@@ -133,7 +159,7 @@ def _mean_of(a: Estimate, b: Estimate, share: float) -> Estimate:
     ]
     square = (1 - share) * a.square + share * b.square
     noise = (1 - share) ** 2 * a.noise + share**2 * b.noise
-    return Estimate(halves, square, noise, a.rays + b.rays)
+    return Estimate(halves, square, noise, a.rays + b.rays, b.timed)
 
 
 def _power_of(halves: list[list[Sparse]], power: Doubles) -> Doubles:

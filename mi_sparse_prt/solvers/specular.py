@@ -8,6 +8,8 @@ is ``bent_light``.
 from __future__ import annotations
 
 import itertools
+import math
+import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -138,6 +140,8 @@ def specular_light(
 class SpecularSearch:
     """Looks for specular light with more and more rays, see ``specular_light``; ``options.error`` plays no part.
 
+    After so many ``seconds``, about, the first rays are fewer, and with noise that tells more.
+
     Attributes
     ----------
     seen : (n, words) uint32 bits or None
@@ -151,8 +155,12 @@ class SpecularSearch:
         options: SpecularOptions,
         ids: Ids | None = None,
         averaging: Averaging | None = None,
+        seconds: float = math.inf,
     ) -> None:
-        every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
+        every, end = (
+            np.arange(len(problem.points)) if ids is None else np.asarray(ids),
+            time.perf_counter() + seconds,
+        )
         seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 128)]
         power = np.square(problem.reflection.albedo[every].astype(np.float64))
         self._direct, self._depths = _direct_norm(problem, every, power, seeds[-1]), problem.depths_apart
@@ -163,7 +171,9 @@ class SpecularSearch:
             )
         if problem.scene.passes_straight and isinstance(problem.emission, CubemapLighting):
             passing = PassingLight(problem, every, power, seeds[32:-1])
-            self._passing = passing.estimated(max(1, options.last) if options.once else None)
+            self._passing = passing.estimated(
+                max(1, options.last) if options.once else None, end - time.perf_counter()
+            )
             self._parts.append(self._passing)
             self.seen = passing.seen
 
@@ -185,13 +195,19 @@ class SpecularSearch:
     def _relative(self, square: float) -> float:
         return float(np.sqrt(sum(part.noise for part in self._parts) / max(square, 1e-300)))
 
-    def refine(self, error: float, noise: float = 0.0) -> None:
-        """Trace more rays until either is about so much: noise relative to all light, or to specular light alone."""
-        for part in self._parts:
+    def refine(self, error: float, noise: float = 0.0, seconds: float = math.inf) -> bool:
+        """Trace more rays until either is about so much: noise relative to all light, or to specular light alone.
+
+        For no more than so many seconds, about; returns whether these were enough.
+        """
+        end, enough = time.perf_counter() + seconds, True
+        for i, part in enumerate(self._parts):
             square = sum(p.total.square for p in self._parts) + self._direct
             others = sum(p.noise for p in self._parts if p is not part) / max(square, 1e-300)
             share = max(error**2 - others, error**2 / len(self._parts))
-            part.refine(Limit(share, share * self._direct, noise**2))
+            left = (end - time.perf_counter()) / (len(self._parts) - i)
+            enough &= part.refine(Limit(share, share * self._direct, noise**2), left)
+        return enough
 
     def light(self) -> SpecularLight:
         """What was found so far."""

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.passed_light import PassingLight, _are_alike, _sum_beside
-from mi_sparse_prt.solvers.refined_mean import Limit
+from mi_sparse_prt.solvers.passed_light import PassingLight, _are_alike, _rays_of, _sum_beside
+from mi_sparse_prt.solvers.refined_mean import Limit, Timed
 
 
 def test_values_are_added_to_those_of_texels_beside():
@@ -88,6 +88,23 @@ def test_elements_without_edges(problem):
     ]
     assert np.array_equal(light._without_edges(), expected)
     assert 0.1 < np.mean(expected) < 0.9
+
+
+def test_rays_that_there_is_time_for(problem, monkeypatch):
+    """
+    Expected: first, one ray in each element where strata take longer than there is time for; then as many in all as
+        are affordable, and nearly as many, or none at all if there is no time for one in each.
+    """
+    light = search(problem, 3)
+    light._timed = Timed(1.0, 2 * len(light._rows))
+    assert light.estimated(seconds=1.5)._expected > 4 * search(problem, 3).estimated()._expected
+    affordable = 2 * 5 * len(light._rows)
+    traced, sampled = [], light._sampled
+    monkeypatch.setattr(light, "_sampled", lambda strata: traced.append(_rays_of(strata)) or sampled(strata))
+    rounds = light.estimated()
+    assert rounds._sample(1e-12, affordable) is not None
+    assert rounds._sample(1e-12, 2 * len(light._rows) - 1) is None
+    assert 0.5 * affordable < traced[1] <= affordable and len(traced) == 2
 
 
 def test_light_that_rounding_leaves_at_the_horizon():

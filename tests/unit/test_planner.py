@@ -668,11 +668,12 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     class Search:
         error, noise, seen = 0.2, 1.0, None
 
-        def __init__(self, *_: object, averaging: object) -> None: ...
+        def __init__(self, *_: object, **__: object) -> None: ...
 
-        def refine(self, error: float, noise: float = 0.0) -> None:
+        def refine(self, error: float, noise: float, _seconds: float) -> bool:
             assert noise == 0
             asked.append(error)
+            return True
 
     module = importlib.import_module("mi_sparse_prt.planner.specular_steps")
     monkeypatch.setattr(module, "SpecularSearch", Search)
@@ -713,10 +714,11 @@ def test_noise_of_specular_light_alone(monkeypatch):
     class Search:
         error, noise, seen = 0.04, 0.3, None
 
-        def __init__(self, *_: object, averaging: object) -> None: ...
+        def __init__(self, *_: object, **__: object) -> None: ...
 
-        def refine(self, error: float, noise: float = 0.0) -> None:
+        def refine(self, error: float, noise: float, _seconds: float) -> bool:
             asked.append((error, noise))
+            return True
 
     monkeypatch.setattr(
         importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
@@ -739,6 +741,41 @@ def test_noise_of_specular_light_alone(monkeypatch):
     assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
     with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
         Settings(8, specular_error=0)
+
+
+def test_specular_light_as_a_source_takes_half_of_the_time(monkeypatch):
+    """
+    Scenario: 80 seconds are left; specular light does not become as exact as is aimed at in its time.
+    Expected: a quarter of them for its first rays, half in all; the noise that there is counts as its error, and no
+        more rays are traced for it, since these took too long once.
+    """
+    given = []
+
+    class Search:
+        error, noise, seen = 0.2, 1.0, None
+
+        def __init__(self, *_: object, seconds: float, **__: object) -> None:
+            given.append(seconds)
+
+        def refine(self, _error: float, _noise: float, seconds: float) -> bool:
+            given.append(seconds)
+            return False
+
+    monkeypatch.setattr(
+        importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
+    )
+    problem = SimpleNamespace(
+        reflection=SimpleNamespace(terms=0),
+        scene=SimpleNamespace(bends_light=False),
+        at_vertices=None,
+        sent=None,
+    )
+    steps = SpecularSteps(problem, Settings(8, target_error=0.05), 0, seconds=80.0)
+    assert given == pytest.approx([20, 40], abs=1)
+    assert steps.error == 0.2 and steps.done
+    parts = {"direct": 0.0, "indirect": 0.03, "specular": 0.19}
+    found = HeldOutError(math.hypot(0.03, 0.19), {}, {"total": 0.0}, 100, parts, [])
+    assert steps.foreseen(found).total == pytest.approx(found.total)
 
 
 def test_too_much_noise_of_specular_light_is_told():

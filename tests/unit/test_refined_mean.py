@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from mi_sparse_prt.solvers.refined_mean import Limit, RefinedMean, Round, compared
+from mi_sparse_prt.solvers.refined_mean import Limit, RefinedMean, Round, Timed, compared
 
 POINTS, TEXELS = 60, 40
 POWER = np.ones((POINTS, 3))
@@ -29,12 +29,12 @@ def test_as_little_noise_as_is_asked_for():
     rng = np.random.default_rng(1)
     noise_of_one = 3 * POINTS * TEXELS * 9 / 2  # of three channels' two halves, each of one ray
 
-    def more(wanted):
+    def more(wanted, _affordable):
         rays = max(int(np.ceil(noise_of_one / wanted)), 1)
         return Round(estimate(rng, rays), noise_of_one / rays, False)
 
     light = RefinedMean(estimate(rng, 4), more)
-    light.refine(Limit(0.0, 40.0, 0.0))
+    assert light.refine(Limit(0.0, 40.0, 0.0))
     errors = light.mean()[0].toarray() - 1
     assert 20 < light.noise <= 44
     assert 3 * np.square(errors).sum() == pytest.approx(light.noise, rel=0.15)
@@ -53,7 +53,7 @@ def test_few_rays_that_find_nothing_take_nothing_away():
             hits = rng.binomial(rays, 0.01, (1, 1)) * (100 / rays)
             return [scipy.sparse.csr_array(hits.astype(np.float32))] * 3
 
-        def more(_, half=half):
+        def more(*_, half=half):
             return Round(compared([half(20), half(20)], np.ones((1, 3)), 40), 3 * 100 / 20 / 2, False)
 
         first = compared([half(160), half(160)], np.ones((1, 3)), 320)
@@ -64,3 +64,25 @@ def test_few_rays_that_find_nothing_take_nothing_away():
     print(f"{np.mean(found):.3f} +- {error:.3f}")
     assert np.mean(found) == pytest.approx(1, abs=4 * error)
     assert error < 0.02
+
+
+def test_no_more_rays_than_there_is_time_for():
+    """
+    Scenario: rays take a millisecond each; ten seconds are left for noise that needs more, or less, than that.
+    Expected: no round is given more rays than its time is enough for, none is begun that has too few, and that the
+        noise stayed is told; light is right all the same.
+    """
+    rng, given = np.random.default_rng(2), []
+    first = estimate(rng, 4)._replace(timed=Timed(4.0, 4000))
+
+    def more(wanted, affordable):
+        given.append(affordable)
+        if len(given) > 1:
+            return None
+        return Round(estimate(rng, 8)._replace(timed=Timed(1.0, 4000)), first.noise / 2, False)
+
+    light = RefinedMean(first, more)
+    assert not light.refine(Limit(0.0, 1e-3, 0.0), 10.0)
+    assert given == pytest.approx([10_000, 40_000], rel=0.05)  # the last rays say what the next ones take
+    assert mean_of(light) == pytest.approx(1, abs=0.1)
+    assert RefinedMean(first, more).refine(Limit(0.0, 2 * first.noise, 0.0), 0.0)

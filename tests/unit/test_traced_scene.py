@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import BALL, GROUND, PALE, T, build, mesh
+from conftest import BALL, GROUND, PALE, T, build, diffuse, mesh
 from test_instances import rays_at
 
 import mi_sparse_prt as prt
@@ -105,3 +105,29 @@ def test_triangles_are_counted_over_all_shapes() -> None:
     assert found.tolist() == list(range(len(corners)))
     missed = scene.normalised.ray_intersect_preliminary(ray, active=False)
     assert not scene.normalised.interaction(missed, ray).is_valid().numpy().any()
+
+
+HOLES = {"type": "checkerboard", "color0": 0.0, "color1": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "expected"),
+    [
+        ({"type": "thindielectric"}, True),
+        ({"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0}, False),
+        ({"type": "thindielectric", "specular_transmittance": HOLES}, False),
+        ({"type": "mask", "opacity": 0.5, "bsdf": diffuse(0.5, 0.5, 0.5)}, True),
+        ({"type": "mask", "opacity": 0.0, "bsdf": diffuse(0.5, 0.5, 0.5)}, False),
+        ({"type": "mask", "opacity": HOLES, "bsdf": diffuse(0.5, 0.5, 0.5)}, False),
+        ({"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse", "reflectance": HOLES}}, True),
+        ({"type": "null"}, False),
+        (diffuse(0.5, 0.5, 0.5), False),
+    ],
+)
+def test_panes_that_dim_light_wherever_it_passes(bsdf, expected):
+    """Expected: what takes some of the light everywhere and at all angles is told; what has holes is not."""
+    scene = build(0.9, card={"type": "rectangle", "bsdf": bsdf})
+    (material,) = scene.materials[: len(scene.fronts)]
+    assert material.dims is expected
+    shapes = 0 if scene.dimming_surfaces is None else len(scene.dimming_surfaces.shapes())
+    assert shapes == int(expected or not material.passes_straight)
