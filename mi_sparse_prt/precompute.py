@@ -469,7 +469,7 @@ def _proposals(
     elapsed = clock.report()["total"]
     if costs is None:
         with clock.phase("plan"):
-            return refinement_schedule(settings, elapsed, direct)
+            return refinement_schedule(settings, elapsed, direct, specular)
     costs = replace(costs, fixed=costs.fixed + elapsed, specular=specular)
     return CandidatePlans(costs, settings)
 

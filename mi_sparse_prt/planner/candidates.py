@@ -300,9 +300,14 @@ def error_without_noise(found: Sequence[tuple[Plan, float]]) -> float:
     return math.sqrt(max(rest, 0.0))
 
 
-def refinement_schedule(settings: Settings, started: float, direct: DirectSolver) -> RefinementSchedule:
-    """The plan of a method; with a target error, from the coarsest of its plans on, after so many seconds."""
-    shares = None if isinstance(settings.method, Plan) else TexelShares(direct, settings)
+def refinement_schedule(
+    settings: Settings, started: float, direct: DirectSolver, specular: float = 0.0
+) -> RefinementSchedule:
+    """The plan of a method; with a target error, from the coarsest of its plans on, after so many seconds.
+
+    ``specular`` is the error of light by way of mirrors and glass, as there will be.
+    """
+    shares = None if isinstance(settings.method, Plan) else TexelShares(direct, settings, started, specular)
     plans: Sequence[Plan]
     if settings.plan is None:  # "auto" with terms of glossy surfaces or at pixels, whose costs no pilot knows
         plans = [settings.with_shares(plan) for plan in EFFORTS["gather"]]

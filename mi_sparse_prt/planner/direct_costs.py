@@ -33,6 +33,11 @@ EDGES_TIMED = 16  # times the points of a pilot
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 
+def negligible_beside(others: float) -> float:
+    """How large an error may be beside others, so that it makes all of them larger by a tenth."""
+    return others * math.sqrt(MINIMUM_GAIN**-2 - 1)
+
+
 @dataclass(frozen=True)
 class DirectCost:
     """Seconds of all direct light, and its error relative to the whole matrix, L2.

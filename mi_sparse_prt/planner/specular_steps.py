@@ -10,7 +10,7 @@ from mi_sparse_prt.core.bits import Bits
 from mi_sparse_prt.estimation.held_out import HeldOutError
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
-from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN
+from mi_sparse_prt.planner.direct_costs import negligible_beside
 from mi_sparse_prt.reconstruction.specular_noise import SpecularNoise
 from mi_sparse_prt.reflection.sent_light import rows_among
 from mi_sparse_prt.solvers.problem import Problem
@@ -53,7 +53,7 @@ class SpecularSteps:
             problem, seed, settings.specular, averaging=averaging, seconds=seconds / 4
         )
         self._enough = self._search.refine(
-            AS_SOURCE * max(self._aim, _worth(others)), self._own or 0.0, end - time.perf_counter()
+            AS_SOURCE * max(self._aim, negligible_beside(others)), self._own or 0.0, end - time.perf_counter()
         )
         self._problem, every = problem, None if problem.sent is None else problem.sent.every
         has_terms = bool(every or problem.reflection.terms)
@@ -110,9 +110,4 @@ class SpecularSteps:
         """
         others = math.sqrt(max(found.total**2 - found.parts.get("specular", 0.0) ** 2, 0.0))
         room = math.sqrt(max((MARGIN * (self._target or 0.0)) ** 2 - others**2, 0.0))
-        self._search.refine(max(self._aim, _worth(others), room), self._own or 0.0, seconds)
-
-
-def _worth(others: float) -> float:
-    """How large an error may be beside others, so that it makes all of them larger by a tenth."""
-    return others * math.sqrt(MINIMUM_GAIN**-2 - 1)
+        self._search.refine(max(self._aim, negligible_beside(others), room), self._own or 0.0, seconds)

@@ -12,7 +12,13 @@ from mi_sparse_prt.estimation.term_pilot import TermPilot
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
 from mi_sparse_prt.planner.choice import MARGIN
-from mi_sparse_prt.planner.direct_costs import MINIMUM_GAIN, DirectCost, adaptive_cost, edges_error
+from mi_sparse_prt.planner.direct_costs import (
+    MINIMUM_GAIN,
+    DirectCost,
+    adaptive_cost,
+    edges_error,
+    negligible_beside,
+)
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
@@ -28,17 +34,24 @@ class TexelShares:
     Shares of texels along edges of visibility are quick, but miss what is narrower than texels: under slats and leaves
     a tenth of the light. Their error is found at some of the points.
 
-    Strata that would take more than half of ``max_seconds`` are left.
+    Strata that would take more than half of what is left of ``max_seconds`` are left.
 
     Parameters
     ----------
     direct : DirectSolver
         In the texel basis.
     settings : Settings
+    elapsed : float
+        Seconds since the beginning.
+    others : float
+        Error of light that is known already: what does not matter beside it is left as well.
     """
 
-    def __init__(self, direct: DirectSolver, settings: Settings) -> None:
+    def __init__(
+        self, direct: DirectSolver, settings: Settings, elapsed: float = 0.0, others: float = 0.0
+    ) -> None:
         self._direct, self._settings = direct, settings
+        self._seconds, self._least = settings.max_seconds - elapsed, negligible_beside(others)
         self._costs: dict[float, DirectCost] = {}  # by what was aimed at
 
     def of(self, plan: Plan, share: float = HALF) -> Plan:
@@ -54,13 +67,16 @@ class TexelShares:
         """
         settings = self._settings
         target = settings.target_error
-        enough, aim = (plan.tolerance if target is None else MARGIN * part * target for part in (share, HALF))
+        enough, aim = (
+            max(plan.tolerance if target is None else MARGIN * part * target, self._least)
+            for part in (share, HALF)
+        )
         if plan.direct != "edges" or plan.indirect != "gather" or self._of_edges <= enough:
             return plan
         if aim not in self._costs:
             self._costs[aim] = adaptive_cost(self._direct, self._held, aim, settings.seed)
         cost = self._costs[aim]
-        better = cost.error <= MINIMUM_GAIN * self._of_edges and cost.seconds < settings.max_seconds / 2
+        better = cost.error <= MINIMUM_GAIN * self._of_edges and cost.seconds < self._seconds / 2
         return replace(plan, direct="adaptive", strata=cost.strata) if better else plan
 
     def seconds(self, plan: Plan) -> float:

@@ -83,6 +83,9 @@ def test_others_keep_edges():
     strict = TexelShares(direct, settings(target_error=0.004)).of(plan)
     assert strict.direct == "adaptive" and strict.rays == plan.rays
     assert TexelShares(direct, settings(target_error=0.004, max_seconds=1e-3)).of(plan) == plan
+    late, beside = TexelShares(direct, settings(target_error=0.004), elapsed=300), {"others": 0.5}
+    assert late.of(plan) == plan
+    assert TexelShares(direct, settings(target_error=0.004), **beside).of(plan) == plan
     for other in (Plan("exact", "gather"), Plan("edges")):
         assert TexelShares(direct, settings(target_error=0.004)).of(other) == other
 
