@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mi_sparse_prt.core.random_keys import element_seeds, random_stream
 from mi_sparse_prt.estimation.darkness import unoccluded_squares
 from mi_sparse_prt.operators.fractional_visibility import FractionalVisibility
-from mi_sparse_prt.scene.scene import TOGETHER
+from mi_sparse_prt.scene.scene import TOGETHER, Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
@@ -23,6 +23,12 @@ STRATA = 4  # shadow rays per axis of a texel
 DIM = 0.1  # of unoccluded light, below which elements may miss most: a hole in a wall is a texel or two of a row
 
 Values = NDArray[np.floating]
+
+
+def vertices_of_each(scene: Scene, count: int) -> int:
+    """How many vertices of each mesh are about so many in all; of many meshes, of each of ``TOGETHER``."""
+    parts = len(scene.sampled_together)
+    return max(1, count // (parts if parts == len(scene.meshes) else parts * TOGETHER))
 
 
 @dataclass(frozen=True)

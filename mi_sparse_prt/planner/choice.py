@@ -198,7 +198,8 @@ def _if_it_met(target: float, p: Predicted) -> float:
 def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str | None:
     """An approximation of direct light on whose error the choice depends: if it were twice as large, or half of it.
 
-    It costs little to find beside all rays, and then its error is known.
+    Then its error is known. In half of the cases it was in vain, so it is to take half as long as what it may stand
+    for, at most.
     """
     if costs.dark:
         return None
@@ -211,7 +212,8 @@ def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str
             ).plan.direct
             for factor in (1 / WORST_FACTOR, WORST_FACTOR)
         }
-        if name in choices and len(choices) > 1:
+        others = [costs.direct[other].seconds for other in choices - {name}]
+        if name in choices and others and 2 * costs.direct[name].seconds <= max(others):
             return name
     return None
 

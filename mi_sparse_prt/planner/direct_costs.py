@@ -30,6 +30,7 @@ PATCHES = 8  # in all, or one for each mesh
 INNER = 4  # one in so many vertices of a patch is judged: the middle ones, which have all their neighbours
 PATCHES_DRAWN = 3  # spawn key
 EDGES_TIMED = 16  # times the points of a pilot
+COMPILED = 16  # points for which kernels are compiled, before others are timed
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 
 
@@ -96,38 +97,41 @@ def adaptive_cost(direct: DirectSolver, held: PilotElements, aim: float, seed: i
     The squared error is that of texels that seem to be seen as a whole, and one that falls as ``across**-3``; rays grow
     as ``across**2``. Two numbers of strata tell both.
     """
-    few, costs, each = _few(direct, held), list[DirectCost](), 0.0
+    few = _few(direct, held)
     importance = importance_of(direct.problem)[held.vertices]
-    for first in FIRST:
-        some, each = _strata_costs(few, importance, held, first, seed)
-        costs += some
+    compiled = few.at(points_at(few.points, np.arange(min(COMPILED, len(held.vertices)))))
+    adaptive_visibility(compiled, Strata(), seed, importance[:COMPILED])
+    costs = [cost for first in FIRST for cost in _strata_costs(few, importance, held, first, seed)]
     good = max(aim, min(cost.error for cost in costs) / MINIMUM_GAIN)
-    best = min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
-    return replace(best, seconds=best.seconds * each)
+    return min((cost for cost in costs if cost.error <= good), key=lambda cost: cost.seconds)
 
 
 def _strata_costs(
     few: Problem, importance: NDArray[np.float32], held: PilotElements, first: int, seed: int
-) -> tuple[list[DirectCost], float]:
-    """Of all that a pilot's points stand for, with rays in place of seconds; and seconds of a ray.
+) -> list[DirectCost]:
+    """Of all that a pilot's points stand for. Points take some time, and rays some more.
 
-    The last rays say what one takes: they are most, and no kernel is compiled for them.
+    Many rays come first: sums over any number of strata are kernels of their own, which few rays need as well.
     """
-    rays, squares, each, costs = [], [], 0.0, []
-    for across in (ACROSS[0], ACROSS[-1]):
+    timed, rays, squares = [], [], []
+    for across in (ACROSS[-1], ACROSS[0]):
         start = time.perf_counter()
         part, traced = adaptive_visibility(few, Strata(first, across), seed, importance)
-        each = (time.perf_counter() - start) / max(int(traced.sum()), 1)
+        timed.append((time.perf_counter() - start, int(traced.sum())))
         rays.append(float(held.stand_for @ traced))
         squares.append(held.squared_error_of_shares(part))
+    (whole, most), (begun, fewest) = timed
+    each = min(max(whole - begun, 0.0) / max(most - fewest, 1), whole / max(most, 1))
+    fixed = max(begun - each * fewest, 0.0) * float(held.stand_for.sum()) / len(held.vertices)
     falls, grows = np.array(ACROSS) ** -3.0, np.array(ACROSS) ** 2.0
-    fall = max(squares[0] - squares[1], 0.0) / (falls[0] - falls[-1])
-    rise = (rays[1] - rays[0]) / (grows[-1] - grows[0])
+    fall = max(squares[1] - squares[0], 0.0) / (falls[0] - falls[-1])
+    rise = (rays[0] - rays[1]) / (grows[-1] - grows[0])
+    costs = []
     for across, falling, growing in zip(ACROSS, falls, grows, strict=True):
-        square = fall * falling + max(squares[1] - fall * falls[-1], 0.0)
-        every = rays[0] + float(rise * (growing - grows[0]))
-        costs.append(DirectCost(every, math.sqrt(square), strata=Strata(first, across)))
-    return costs, each
+        square = fall * falling + max(squares[0] - fall * falls[-1], 0.0)
+        seconds = fixed + each * (rays[1] + float(rise * (growing - grows[0])))
+        costs.append(DirectCost(seconds, math.sqrt(square), strata=Strata(first, across)))
+    return costs
 
 
 def _few(direct: DirectSolver, held: PilotElements) -> Problem:

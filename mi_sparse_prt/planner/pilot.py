@@ -8,7 +8,7 @@ from dataclasses import replace
 from mi_sparse_prt.estimation.darkness import DARK
 from mi_sparse_prt.estimation.element_sampling import Effort
 from mi_sparse_prt.estimation.held_out import ROUND
-from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.pilot_elements import PilotElements, vertices_of_each
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import MARGIN, Costs, choose, predictions
 from mi_sparse_prt.planner.direct_costs import (
@@ -54,7 +54,7 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
         ``fixed`` is that of held-out elements.
     """
     problem, scene = direct.problem, direct.problem.scene
-    count = max(LEAST_VERTICES, VERTICES // len(scene.meshes))
+    count = max(LEAST_VERTICES, vertices_of_each(scene, VERTICES))
     seed, lighting = settings.seed, direct.lighting
     held = PilotElements(problem, indirect, seed, count, TEXELS)
     auto, exact = settings.method == "auto", exact_cost(direct, held)

@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from functools import cached_property
 
-from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.pilot_elements import PilotElements, vertices_of_each
 from mi_sparse_prt.estimation.term_pilot import TermPilot
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
@@ -20,7 +20,6 @@ from mi_sparse_prt.planner.direct_costs import (
     negligible_beside,
 )
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
-from mi_sparse_prt.scene.scene import TOGETHER
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 POINTS = 1024  # of a pilot, all together
@@ -92,13 +91,8 @@ class TexelShares:
     @cached_property
     def _held(self) -> PilotElements:
         problem = self._direct.problem
-        strata = problem.scene.sampled_together
-        if problem.measurement.kind != "vertices":
-            count = POINTS
-        elif len(strata) == len(problem.scene.meshes):
-            count = max(1, POINTS // len(strata))
-        else:
-            count = max(1, POINTS // (len(strata) * TOGETHER))
+        at_vertices = problem.measurement.kind == "vertices"
+        count = vertices_of_each(problem.scene, POINTS) if at_vertices else POINTS
         if isinstance(problem.reflection, InOutFactors):
             return TermPilot(problem, self._settings.seed, count, TEXELS)
         return PilotElements(problem, False, self._settings.seed, count, TEXELS)
