@@ -41,7 +41,7 @@ def negligible_beside(others: float) -> float:
 
 @dataclass(frozen=True)
 class DirectCost:
-    """Seconds of all direct light, and its error relative to the whole matrix, L2.
+    """Seconds of all direct light, and its error relative to that of a pilot's elements, or to the whole matrix, L2.
 
     ``centres`` are those seconds that rays to texels' centres take, ``strata`` those of an adaptive plan.
     """
@@ -55,6 +55,10 @@ class DirectCost:
     def with_known_centres(self) -> DirectCost:
         """Where these rays have been traced for something else."""
         return replace(self, seconds=self.seconds - self.centres, centres=0.0)
+
+    def beside_indirect(self, share: float) -> DirectCost:
+        """With an error relative to the whole matrix, if relative to direct light, which is a share of it."""
+        return replace(self, error=share * self.error)
 
 
 def exact_cost(direct: DirectSolver, held: PilotElements) -> DirectCost:

@@ -31,7 +31,9 @@ from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 VERTICES = 192  # of a pilot, in all meshes together
 LEAST_VERTICES = 16  # of each
-TEXELS = 16
+TEXELS = 16  # of each vertex, for indirect light
+# for direct light: few of them are seen in part, and rays cost next to nothing
+LIGHT_TEXELS = 256
 LESS_NOISE = 0.3  # variance on a coarse cubemap, at the least, for as many samples per element
 DRAWN = 0.6e-6  # seconds per element of a check that is drawn for direct light
 
@@ -57,12 +59,14 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     count = max(LEAST_VERTICES, vertices_of_each(scene, VERTICES))
     seed, lighting = settings.seed, direct.lighting
     held = PilotElements(problem, indirect, seed, count, TEXELS)
-    auto, exact = settings.method == "auto", exact_cost(direct, held)
+    rays = PilotElements(problem, False, seed, count, LIGHT_TEXELS)
+    auto, exact = settings.method == "auto", exact_cost(direct, rays)
     light = {"exact": exact}
     if auto and settings.basis == "direction":
-        light["consensus"] = consensus_cost(direct, held, seed)
+        light["consensus"] = consensus_cost(direct, rays, seed)
     elif auto:
-        light["edges"] = edges_cost(direct, held)
+        light["edges"] = edges_cost(direct, rays)
+    light = {how: cost.beside_indirect(held.direct_share) for how, cost in light.items()}
     check = _check(held)
     # light by way of mirrors and glass is not among the elements
     dark = not problem.specular_apart and held.light() <= DARK
@@ -70,13 +74,13 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     if settings.target_error is not None:
         costs = replace(costs, fixed=(1 + ROUND) * check, check=check)
     if not indirect:
-        return _with_adaptive(costs, direct, held, settings)
+        return _with_adaptive(costs, direct, rays, settings)
     path = seconds_of_a_path(problem, settings, lighting)
     fine, asked = lighting.resolution, settings.indirect_resolution
     costs = replace(costs, paths=path_costs(problem, settings, held, path, [asked or fine]))
     if auto:
         costs = replace(costs, gather=gather_costs(direct, held, seed))
-    costs = _with_adaptive(costs, direct, held, settings)
+    costs = _with_adaptive(costs, direct, rays, settings)
     if auto and settings.basis == "direction" and asked in (None, fine):
         sparse = SparseCosts(scene.n_vertices, exact.seconds, path, noise_of_a_path(held), settings.samples)
         costs = replace(costs, sparse=sparse)
@@ -86,7 +90,7 @@ def measure(direct: DirectSolver, settings: Settings, indirect: bool) -> Costs:
     return costs
 
 
-def _with_adaptive(costs: Costs, direct: DirectSolver, held: PilotElements, settings: Settings) -> Costs:
+def _with_adaptive(costs: Costs, direct: DirectSolver, rays: PilotElements, settings: Settings) -> Costs:
     """Adaptive strata as well, where other direct light is not good enough.
 
     A floor below indirect light, where paths take too long, leaves nothing to gain from direct light that is clearly
@@ -107,8 +111,9 @@ def _with_adaptive(costs: Costs, direct: DirectSolver, held: PilotElements, sett
         if floor > target and min(paths) > settings.max_seconds:
             aim = max(aim, floor * math.sqrt(MINIMUM_GAIN**-2 - 1))
     if min(cost.error for cost in costs.direct.values()) > aim:
-        adaptive = adaptive_cost(direct, held, aim, settings.seed)
-        costs = replace(costs, direct={**costs.direct, "adaptive": adaptive})
+        share = costs.direct_share
+        adaptive = adaptive_cost(direct, rays, aim / max(share, 1e-30), settings.seed)
+        costs = replace(costs, direct={**costs.direct, "adaptive": adaptive.beside_indirect(share)})
     return costs
 
 

@@ -23,7 +23,7 @@ from mi_sparse_prt.reflection.in_out_factors import InOutFactors
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 POINTS = 1024  # of a pilot, all together
-TEXELS = 16
+TEXELS = 64  # of each
 HALF = math.sqrt(0.5)  # of a target error, whose square is half of its own
 
 

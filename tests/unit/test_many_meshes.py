@@ -9,7 +9,7 @@ import mi_sparse_prt as prt
 from mi_sparse_prt.estimation import held_out
 from mi_sparse_prt.estimation.element_sampling import Effort
 from mi_sparse_prt.estimation.held_out import _Estimator, held_out_error
-from mi_sparse_prt.estimation.pilot_elements import PilotElements
+from mi_sparse_prt.estimation.pilot_elements import PilotElements, vertices_of_each
 from mi_sparse_prt.measurement.measurement import mesh_vertices
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.reflection.reflection import Diffuse
@@ -71,6 +71,10 @@ def test_a_pilot_looks_at_a_few_hundred_vertices(scene):
     held = PilotElements(diffuse_problem(scene, LIGHTING, max_depth=2), False, 0, 16, 4)
     assert len(held.vertices) == 16 * TOGETHER
     assert held.stand_for.sum() == pytest.approx(scene.n_vertices)
+    # as many in all as of few meshes
+    assert vertices_of_each(scene, 192) * TOGETHER == 192
+    few = build(0.5, a={"type": "cube"}, b={"type": "rectangle"})
+    assert vertices_of_each(few, 192) * len(few.meshes) == 192
 
 
 @pytest.mark.slow  # that of few: test_held_out.py; that of each by itself: below

@@ -355,6 +355,10 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
     """
     assert [uncertain(Costs(0, BOTH), target) for target in (0.003, 0.02, 0.05)] == [None, "consensus", None]
     assert uncertain(Costs(0, EXACT), 0.02) is None
+    seconds = EXACT["exact"].seconds
+    for share, found in ((0.49, "consensus"), (0.51, None)):  # in half of the cases it is found in vain
+        slower = EXACT | {"consensus": DirectCost(share * seconds, 0.012)}
+        assert uncertain(Costs(0, slower), 0.02) == found
     for error, seconds, plan in ((0.021, 1 + 4.0, "consensus"), (0.023, 1 + 14.0, "exact")):
         ranking = CandidatePlans(Costs(1, BOTH, direct_share=0.9), Settings(4, target_error=0.02))
         assert ranking.uncertain == "consensus"
@@ -591,6 +595,17 @@ def test_costs_of_what_is_left_open(grey_scene, indirect):
     assert (costs.gather is not None) == (costs.paths is not None) == indirect
     if costs.paths:
         assert costs.paths.seconds.keys() == {2}
+
+
+def test_errors_of_direct_light_are_parts_of_those_of_all(grey_scene):
+    """Expected: beside indirect light, what they are alone times the share that direct light has of all."""
+    direct = DirectSolver(problem_at(grey_scene, LIGHTING, basis="texel"))
+    settings = Settings(4, basis="texel", indirect_resolution=2)
+    alone, all_of_it = (measure(direct, settings, indirect) for indirect in (False, True))
+    assert alone.direct_share == 1 and 0.5 < all_of_it.direct_share < 0.999
+    for how in ("exact", "edges"):
+        expected = all_of_it.direct_share * alone.direct[how].error
+        assert all_of_it.direct[how].error == pytest.approx(expected, rel=1e-6) and expected > 0
 
 
 @pytest.mark.filterwarnings("error", "ignore:.*faces point inwards")
