@@ -129,7 +129,8 @@ def precompute(
         serve any BRDF (``LightTransport.with_bsdf``).
     max_seconds : float
         ``"auto"`` begins nothing that is predicted to take longer in all: of the plans within it the one that suits
-        the target error best is carried out, and a warning says what more time would buy.
+        the target error best is carried out, and a warning says what more time would buy. Light by way of mirrors and
+        glass takes half of it at most, and a warning tells the noise that stays.
     specular_error : float, optional
         Noise of light by way of mirrors and glass that is small enough, relative L2 of that light alone, even if it is
         much of all: it is sharp, and each halving of its noise takes four times the rays. If given,
@@ -218,7 +219,8 @@ class _Attempts:
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
             error = held_out_error(problem, transport, run.seed, indirect=self._dark is None)
-        _warn_if_missed(error, self._settings, self._proposals.too_long)
+        ended = self._specular is not None and self._specular.ended
+        _warn_if_missed(error, self._settings, self._proposals.too_long, ended)
         _warn_of_specular_noise(parts.specular, error, self._settings)
         transport.report.update(
             _account(parts, problem, [*_skipped(problem.scene, self._dark, error), *self._left_out])
@@ -499,8 +501,13 @@ def _check_time(expected: Forecast, max_seconds: float) -> None:
         )
 
 
-def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted | None) -> None:
-    """Say that an error is above the target; or, where ``"auto"`` aimed at 2% unasked, that it is far above."""
+def _warn_if_missed(
+    error: HeldOutError, settings: Settings, too_long: Predicted | None, ended: bool = False
+) -> None:
+    """Say that an error is above the target; or, where ``"auto"`` aimed at 2% unasked, that it is far above.
+
+    And what would help; ``ended`` is the search for light by way of mirrors and glass, if it took too long.
+    """
     target, asked = settings.target_error, settings.target_error is not None
     if settings.method == "auto" and target is None and not settings.view_dependent:
         target = WORST_FACTOR * TARGET
@@ -516,6 +523,10 @@ def _warn_if_missed(error: HeldOutError, settings: Settings, too_long: Predicted
         more = f'; method="{method}" would meet it in about {time}'
         if settings.method == "auto" and seconds > settings.max_seconds:
             more += f", max_seconds={settings.max_seconds:g} rules it out"
+    if ended:
+        noise = error.parts.get("specular", 0.0)
+        more += f"; {noise:.3g} is noise of light by way of mirrors and glass, max_seconds={settings.max_seconds:g}"
+        more += " ended the search for it"
     missed = (
         f"the target error {target:g} was not met" if asked else "no target error was given, 2% was aimed at"
     )

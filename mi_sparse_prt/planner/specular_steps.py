@@ -92,6 +92,11 @@ class SpecularSteps:
         return self._search.error**2 > 0.5 * self._search.noise**2
 
     @property
+    def ended(self) -> bool:
+        """Whether time ended the search, not how little noise there is."""
+        return not self._enough
+
+    @property
     def done(self) -> bool:
         """Whether there is no more noise than is aimed at, or enough, or as much as time does not take away."""
         return not self._enough or self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)

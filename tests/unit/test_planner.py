@@ -477,6 +477,14 @@ def test_a_matrix_far_from_what_was_aimed_at_is_told(error, given, said):
         assert "max_seconds=300 rules it out" in str(caught[0].message)
 
 
+def test_noise_that_time_leaves_is_told():
+    parts = {"direct": 0.01, "indirect": 0.02, "specular": 0.07}
+    found = HeldOutError(0.08, {}, {"total": 0.001}, 100, parts, [])
+    said = "0.07 is noise of light by way of mirrors and glass, max_seconds=300 ended the search for it"
+    with pytest.warns(prt.PrtWarning, match=said):
+        _warn_if_missed(found, Settings(32, target_error=0.05), None, ended=True)
+
+
 def test_a_report_is_json():
     found = best(Costs(0, BOTH, PATHS, FakeGather()), 0.05)
     report = found.report(True)
@@ -671,6 +679,14 @@ def test_what_one_kind_of_direct_light_turns_out_to_be_tells_of_others():
     assert after["exact"] == kinds["exact"]
 
 
+NO_TERMS = SimpleNamespace(
+    reflection=SimpleNamespace(terms=0),
+    scene=SimpleNamespace(bends_light=False),
+    at_vertices=None,
+    sent=None,
+)
+
+
 def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     """
     Scenario: the first rays find light of which 20% is noise; at the end other errors are known.
@@ -692,12 +708,6 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
 
     module = importlib.import_module("mi_sparse_prt.planner.specular_steps")
     monkeypatch.setattr(module, "SpecularSearch", Search)
-    problem = SimpleNamespace(
-        reflection=SimpleNamespace(terms=0),
-        scene=SimpleNamespace(bends_light=False),
-        at_vertices=None,
-        sent=None,
-    )
     cases = (
         (0.05, 0.3, 0.1453),
         (0.05, 0.01, 0.0464),
@@ -707,7 +717,7 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
     )
     for target, others, least in cases:
         asked.clear()
-        steps = SpecularSteps(problem, Settings(8, target_error=target), 0)
+        steps = SpecularSteps(NO_TERMS, Settings(8, target_error=target), 0)
         aim = (target or 0.02) / math.sqrt(2)
         assert steps.error == pytest.approx(aim) and not steps.done
         parts = {"direct": 0.0, "indirect": others, "specular": 0.18}
@@ -738,13 +748,7 @@ def test_noise_of_specular_light_alone(monkeypatch):
     monkeypatch.setattr(
         importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
     )
-    problem = SimpleNamespace(
-        reflection=SimpleNamespace(terms=0),
-        scene=SimpleNamespace(bends_light=False),
-        at_vertices=None,
-        sent=None,
-    )
-    steps = SpecularSteps(problem, Settings(8, target_error=0.02, specular_error=0.1), 0)
+    steps = SpecularSteps(NO_TERMS, Settings(8, target_error=0.02, specular_error=0.1), 0)
     assert steps.error == 0 and not steps.done
     found = HeldOutError(
         0.05, {}, {"total": 0.0}, 100, {"direct": 0.0, "indirect": 0.03, "specular": 0.04}, []
@@ -753,7 +757,7 @@ def test_noise_of_specular_light_alone(monkeypatch):
     steps.refine(found)
     assert asked[0] == (pytest.approx(2 * 0.02 / math.sqrt(2)), 0.1)
     assert asked[1] == (pytest.approx(0.03 * math.sqrt(1 / 0.81 - 1), rel=0.01), 0.1)
-    assert SpecularSteps(problem, Settings(8, specular_error=0.31), 0).done
+    assert SpecularSteps(NO_TERMS, Settings(8, specular_error=0.31), 0).done
     with pytest.raises(prt.PrtError, match="specular_error is 0; it must be positive"):
         Settings(8, specular_error=0)
 
@@ -779,15 +783,9 @@ def test_specular_light_as_a_source_takes_half_of_the_time(monkeypatch):
     monkeypatch.setattr(
         importlib.import_module("mi_sparse_prt.planner.specular_steps"), "SpecularSearch", Search
     )
-    problem = SimpleNamespace(
-        reflection=SimpleNamespace(terms=0),
-        scene=SimpleNamespace(bends_light=False),
-        at_vertices=None,
-        sent=None,
-    )
-    steps = SpecularSteps(problem, Settings(8, target_error=0.05), 0, seconds=80.0)
+    steps = SpecularSteps(NO_TERMS, Settings(8, target_error=0.05), 0, seconds=80.0)
     assert given == pytest.approx([20, 40], abs=1)
-    assert steps.error == 0.2 and steps.done
+    assert steps.error == 0.2 and steps.done and steps.ended
     parts = {"direct": 0.0, "indirect": 0.03, "specular": 0.19}
     found = HeldOutError(math.hypot(0.03, 0.19), {}, {"total": 0.0}, 100, parts, [])
     assert steps.foreseen(found).total == pytest.approx(found.total)
