@@ -198,23 +198,22 @@ def _if_it_met(target: float, p: Predicted) -> float:
 def uncertain(costs: Costs, target: float | None, spp: int | None = None) -> str | None:
     """An approximation of direct light on whose error the choice depends: if it were twice as large, or half of it.
 
-    Then its error is known. In half of the cases it was in vain, so it is to take half as long as what it may stand
-    for, at most.
+    Then its error is known. In half of the cases it was in vain, so it is to take no longer than it may save.
     """
     if costs.dark:
         return None
     for name in costs.direct:
         if name in ("exact", "adaptive"):
             continue
-        choices = {
-            choose(
-                predictions(_with_error_times(factor, costs, name), target or TARGET, spp), target
-            ).plan.direct
+        chosen = [
+            choose(predictions(_with_error_times(factor, costs, name), target or TARGET, spp), target)
             for factor in (1 / WORST_FACTOR, WORST_FACTOR)
-        }
-        others = [costs.direct[other].seconds for other in choices - {name}]
-        if name in choices and others and 2 * costs.direct[name].seconds <= max(others):
-            return name
+        ]
+        seconds = {plan.plan.direct: plan.seconds for plan in chosen}
+        if len(seconds) > 1 and name in seconds:
+            saved = max(seconds.values()) - seconds[name]
+            if costs.direct[name].seconds <= saved:
+                return name
     return None
 
 
