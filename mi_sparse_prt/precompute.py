@@ -213,6 +213,7 @@ class _Attempts:
         first = self._direct_light()
         if first:
             expected = self._forecast()
+        expected = self._with_specular(expected)
         if run.progress:
             tqdm.write(_expectation(problem, expected))
         parts, plan = self._evaluated(first)
@@ -247,6 +248,15 @@ class _Attempts:
             if light is None:
                 return expected
             return expected._replace(seconds=beside_direct_light(light, plan, indirect))
+
+    def _with_specular(self, expected: Forecast) -> Forecast:
+        """From the beginning, and with the rays that noise of specular light is still going to take."""
+        seconds, specular = expected.seconds, self._specular
+        if self._proposals.seconds is None:
+            seconds += self._run.clock.report()["total"]
+        if specular is not None:
+            seconds += min(specular.remaining, self._time_left())
+        return expected._replace(seconds=seconds)
 
     def _fits(self, plan: Plan) -> bool:
         """Whether there is memory for one more attempt; if not, the report will say so."""

@@ -43,7 +43,8 @@ class SpecularSteps:
     def __init__(
         self, problem: Problem, settings: Settings, seed: int, others: float = 0.0, seconds: float = math.inf
     ) -> None:
-        end = time.perf_counter() + seconds / 2
+        begin = time.perf_counter()
+        end = begin + seconds / 2
         self._aim, self._target = settings.specular.error, settings.target_error
         self._own = settings.specular_error
         averaging = None
@@ -55,6 +56,7 @@ class SpecularSteps:
         self._enough = self._search.refine(
             AS_SOURCE * max(self._aim, negligible_beside(others)), self._own or 0.0, end - time.perf_counter()
         )
+        self._spent = time.perf_counter() - begin
         self._problem, every = problem, None if problem.sent is None else problem.sent.every
         has_terms = bool(every or problem.reflection.terms)
         self._terms = term_rows(problem, seed, self._search.passed, every) if has_terms else None
@@ -100,6 +102,11 @@ class SpecularSteps:
     def done(self) -> bool:
         """Whether there is no more noise than is aimed at, or enough, or as much as time does not take away."""
         return not self._enough or self._search.error <= self._aim or self._search.noise <= (self._own or 0.0)
+
+    @property
+    def remaining(self) -> float:
+        """Seconds that more rays take, about, until there is as much noise as is aimed at: it falls as their root."""
+        return 0.0 if self.done else self._spent * max((self._search.error / self._aim) ** 2 - 1, 0.0)
 
     def foreseen(self, found: HeldOutError) -> HeldOutError:
         """Errors of a matrix with this light, found now, as they will be with ``error``: those that a target is for."""

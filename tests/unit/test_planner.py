@@ -724,6 +724,8 @@ def test_specular_light_is_as_exact_as_what_is_beside_it(monkeypatch):
         found = steps.foreseen(HeldOutError(math.hypot(others, 0.18), {}, {"total": 0.0}, 100, parts, []))
         assert found.parts["specular"] == pytest.approx(0.9 * aim)
         assert found.total == pytest.approx(math.hypot(others, 0.9 * aim))
+        spent, ratio = steps._spent, (0.2 / aim) ** 2  # noise falls as the root of rays
+        assert steps.remaining == pytest.approx(spent * (ratio - 1))
         steps.refine(found)
         assert asked == pytest.approx([2 * aim, least], rel=0.01)
 
@@ -786,6 +788,7 @@ def test_specular_light_as_a_source_takes_half_of_the_time(monkeypatch):
     steps = SpecularSteps(NO_TERMS, Settings(8, target_error=0.05), 0, seconds=80.0)
     assert given == pytest.approx([20, 40], abs=1)
     assert steps.error == 0.2 and steps.done and steps.ended
+    assert steps.remaining == 0
     parts = {"direct": 0.0, "indirect": 0.03, "specular": 0.19}
     found = HeldOutError(math.hypot(0.03, 0.19), {}, {"total": 0.0}, 100, parts, [])
     assert steps.foreseen(found).total == pytest.approx(found.total)
