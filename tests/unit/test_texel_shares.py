@@ -197,6 +197,8 @@ def test_indirect_light_is_kept(monkeypatch):
         bit, as if these had come first, and with indirect light that was gathered once.
     """
     scene, found = slatted(0.4, METAL), []
+    # of two first ones, times of milliseconds would choose
+    monkeypatch.setattr("mi_sparse_prt.planner.direct_costs.FIRST", (2,))
     for share in (FIRST_SHARE, 100.0):
         monkeypatch.setattr("mi_sparse_prt.planner.candidates.FIRST_SHARE", share)
         with warnings.catch_warnings():
