@@ -12,11 +12,11 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements, vertices_of_e
 from mi_sparse_prt.methods.settings import TARGET, Settings
 from mi_sparse_prt.planner.choice import MARGIN, Costs, choose, predictions
 from mi_sparse_prt.planner.direct_costs import (
-    MINIMUM_GAIN,
     adaptive_cost,
     consensus_cost,
     edges_cost,
     exact_cost,
+    negligible_beside,
 )
 from mi_sparse_prt.planner.path_costs import (
     COARSEST,
@@ -109,7 +109,7 @@ def _with_adaptive(costs: Costs, direct: DirectSolver, rays: PilotElements, sett
             for at, each in costs.paths.seconds.items()
         )
         if floor > target and min(paths) > settings.max_seconds:
-            aim = max(aim, floor * math.sqrt(MINIMUM_GAIN**-2 - 1))
+            aim = max(aim, negligible_beside(floor))
     if min(cost.error for cost in costs.direct.values()) > aim:
         share = costs.direct_share
         adaptive = adaptive_cost(direct, rays, aim / max(share, 1e-30), settings.seed)

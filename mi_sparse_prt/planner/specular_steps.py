@@ -84,9 +84,9 @@ class SpecularSteps:
 
         What takes too long as a source is not begun again.
         """
-        return (
-            0.0 if self._own else min(self._aim, self._search.error) if self._enough else self._search.error
-        )
+        if self._own:
+            return 0.0
+        return min(self._aim, self._search.error) if self._enough else self._search.error
 
     @property
     def most(self) -> bool:

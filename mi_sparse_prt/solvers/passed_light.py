@@ -63,10 +63,10 @@ class PassingLight:
         if across is not None or not len(squares):
             return RefinedMean(first)
         law = self._averaged(squares * strata**3.0)
-        between, own = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:]), law**0.2
+        between, best = np.sqrt(np.array(STRATA[:-1]) * STRATA[1:]), law**0.2
 
         def strata_of(scale: float) -> NDArray[np.int64]:
-            return np.array(STRATA)[np.searchsorted(between, scale * own)]
+            return np.array(STRATA)[np.searchsorted(between, scale * best)]
 
         def sample(wanted: float, affordable: float) -> Round | None:
             if affordable < 2 * len(law):

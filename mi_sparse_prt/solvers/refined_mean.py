@@ -47,7 +47,7 @@ class Timed(NamedTuple):
 
     def rays_in(self, seconds: float) -> float:
         """How many rays a time is enough for."""
-        return seconds * self.rays / self.seconds if self.seconds > 0 else math.inf
+        return seconds * self.rays / self.seconds if self.rays and self.seconds > 0 else math.inf
 
 
 class Estimate(NamedTuple):

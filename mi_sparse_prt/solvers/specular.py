@@ -157,10 +157,8 @@ class SpecularSearch:
         averaging: Averaging | None = None,
         seconds: float = math.inf,
     ) -> None:
-        every, end = (
-            np.arange(len(problem.points)) if ids is None else np.asarray(ids),
-            time.perf_counter() + seconds,
-        )
+        end = time.perf_counter() + seconds
+        every = np.arange(len(problem.points)) if ids is None else np.asarray(ids)
         seeds = [int(s) for s in element_seeds(random_stream(seed, SPECULAR), 128)]
         power = np.square(problem.reflection.albedo[every].astype(np.float64))
         self._direct, self._depths = _direct_norm(problem, every, power, seeds[-1]), problem.depths_apart

@@ -107,6 +107,19 @@ def test_rays_that_there_is_time_for(problem, monkeypatch):
     assert 0.5 * affordable < traced[1] <= affordable and len(traced) == 2
 
 
+def test_first_rays_in_no_time_are_unbiased(problem):
+    """Expected: one ray of each half in each element finds the light of 256 rays, on average; 2% would show."""
+    n = problem.emission.n_directions
+    fine = DirectSolver(problem, 16).partly_passed(np.repeat(IDS, n), np.tile(np.arange(n), len(IDS)))
+    sums = [
+        search(problem, seed).estimated(seconds=0.0).mean()[0].sum() / fine.values.sum() for seed in range(12)
+    ]
+    spread = np.std(sums, ddof=1) / np.sqrt(len(sums))
+    print(f"{np.mean(sums):.4f} +- {spread:.4f}")
+    assert spread < 0.0045
+    assert np.mean(sums) == pytest.approx(1, abs=4 * spread + 0.001)
+
+
 def test_light_that_rounding_leaves_at_the_horizon():
     """A cosine of exactly 0 beside light that came by one of 1e-9: an edge, and no division by it."""
     lighting = prt.CubemapLighting(1)
