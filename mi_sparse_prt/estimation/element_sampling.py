@@ -60,10 +60,10 @@ class Effort:
 
     rays: float = 0.002
     fewest_rays: int = 1 << 16
-    paths: int = 6144
+    paths: int = 8192
     few_paths: int = 512
     fewest_paths: int = 64
-    spp: int = 512
+    spp: int = 128
     strata: int = 4
     specular: int = 128
     specular_strata: int = 4

@@ -387,7 +387,9 @@ class _Estimator:
         found = []
         for first, second in (errors, values):
             own = first * second - variance  # [element, row, channel]
-            of_rows = np.broadcast_to(own, (*own.shape[:2], 3)).sum(axis=2)  # one channel stands for three
+            of_rows = np.einsum(
+                "mrc->mr", np.broadcast_to(own, (*own.shape[:2], 3))
+            )  # one channel stands for three
             found.append(np.column_stack([_quadratic(gram, first, second, own), of_rows]))
         squares, norms = found
         return Sample(chosen.weights, squares, norms, self._shares[chosen.vertices])
@@ -423,9 +425,9 @@ class _Estimator:
 
 def _quadratic(gram: Doubles, first: Doubles, second: Doubles, products: Doubles) -> Doubles:
     """``first^T gram second`` summed over colours, (m,); of one row from its product. One channel stands for three."""
-    if gram.shape[1] == 1:
-        return (gram[:, 0] * products).sum(axis=(1, 2))
     colours = (*gram.shape[:2], 3)
+    if gram.shape[1] == 1:
+        return np.einsum("mac,mac->m", gram[:, 0], np.broadcast_to(products, colours))
     pair = np.broadcast_to(first, colours), np.broadcast_to(second, colours)
     return np.einsum("mabc,mac,mbc->m", gram, *pair, optimize=True)
 

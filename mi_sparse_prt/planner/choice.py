@@ -73,6 +73,12 @@ class Costs:
     bent: bool = False
     dark: bool = False
 
+    def with_paths_of(self, path: float, finest: int) -> Costs:
+        """The same, if a path for every element at the finest resolution takes so many seconds."""
+        assert self.paths is not None
+        sparse = None if self.sparse is None else replace(self.sparse, path=path)
+        return replace(self, paths=self.paths.priced(path, finest), sparse=sparse)
+
 
 @dataclass(frozen=True)
 class Predicted:

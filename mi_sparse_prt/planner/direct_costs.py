@@ -32,6 +32,8 @@ PATCHES_DRAWN = 3  # spawn key
 EDGES_TIMED = 16  # times the points of a pilot
 COMPILED = 16  # points for which kernels are compiled, before others are timed
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
+SAVED = 0.5  # of all rays, by consensus; about as much as it ever saves
+BEGUN = 0.2  # seconds of a pilot's consensus beside its rays
 
 
 def negligible_beside(others: float) -> float:
@@ -146,6 +148,12 @@ def _few(direct: DirectSolver, held: PilotElements) -> Problem:
 def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
     """Some of the points."""
     return Points(*(x[ids] for x in (points.positions, points.normals, points.offset_normals, points.keys)))
+
+
+def consensus_may_pay(direct: DirectSolver, exact: DirectCost) -> bool:
+    """Whether consensus may save more than it takes to find out, by all rays at the vertices of patches."""
+    measured = PATCH * max(PATCHES, len(direct.problem.scene.sampled_together)) / len(direct.points)
+    return exact.seconds * (SAVED - measured) > BEGUN
 
 
 def consensus_cost(

@@ -41,6 +41,10 @@ class PathCosts:
     noise: dict[int, float]
     bias: dict[int, float]
 
+    def priced(self, path: float, finest: int) -> PathCosts:
+        """The same, if a path for every element at the finest resolution takes so many seconds."""
+        return replace(self, seconds={r: (r / finest) ** 2 * path for r in self.bias})
+
     def error(self, resolution: int, spp: int) -> float:
         """Predicted relative L2 error of the whole matrix."""
         return math.sqrt(self.bias[resolution] ** 2 + self.noise[resolution] ** 2 / spp)
@@ -82,8 +86,7 @@ def path_costs(
         rest = held.relative_square(held.error_of(held.indirect, mean * power) - own)
         bias[resolution] = math.sqrt(max(rest, 0.0))
         noise[resolution] = math.sqrt(held.relative_square(own) * spp)
-    share = {r: (r / lighting.resolution) ** 2 for r in bias}
-    return PathCosts({r: share[r] * path for r in bias}, noise, bias)
+    return PathCosts({}, noise, bias).priced(path, lighting.resolution)
 
 
 def coarse_resolutions(finest: int) -> list[int]:

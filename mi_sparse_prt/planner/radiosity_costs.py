@@ -26,7 +26,7 @@ from mi_sparse_prt.solvers.form_factors import gather_matrix
 GATHERED = 4  # spawn key
 FEW, MANY = 64, 256  # rays per vertex of a pilot
 PATHS = 256  # per element that tell a bias: fewer would see one of 0.5% where there is none
-TIMED = 2048  # rays per vertex, where these are timed
+TIMED = 1024  # rays per vertex, where these are timed
 SAMPLE = 256  # vertices, and as many texels, that tell the rank
 FINE = 0.03  # tolerance below which a sample tells little
 HALVES = 4  # of that sample: what half of it tells is a mean over so many

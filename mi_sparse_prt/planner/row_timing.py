@@ -9,7 +9,7 @@ import numpy as np
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.paths import PathSolver
 
-SHARE = 8  # a pilot traces this fraction of one wavefront
+SHARE = 32  # a pilot traces this fraction of one wavefront
 
 
 def seconds_per_row(solver: DirectSolver | PathSolver) -> float:

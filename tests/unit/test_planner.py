@@ -20,6 +20,7 @@ from mi_sparse_prt.estimation.pilot_elements import PilotElements
 from mi_sparse_prt.methods.consensus_visibility import by_consensus
 from mi_sparse_prt.methods.plan import GATHER, Plan
 from mi_sparse_prt.methods.settings import Settings
+from mi_sparse_prt.planner import pilot
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, error_without_noise
 from mi_sparse_prt.planner.choice import (
     MARGIN,
@@ -34,7 +35,7 @@ from mi_sparse_prt.planner.choice import (
     weighed,
     with_direct,
 )
-from mi_sparse_prt.planner.direct_costs import PATCH, DirectCost, consensus_cost
+from mi_sparse_prt.planner.direct_costs import PATCH, PATCHES, DirectCost, consensus_cost, consensus_may_pay
 from mi_sparse_prt.planner.path_costs import PathCosts
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.radiosity_costs import GatherCosts
@@ -374,6 +375,7 @@ def test_direct_light_that_the_choice_depends_on_is_found_first():
 def test_direct_light_that_was_tried_counts_once(grey_scene, monkeypatch, target, plan):
     """Rays of a trial are among those of the matrix, whether the trial was good enough or all were traced after it."""
     monkeypatch.setattr(CandidatePlans, "uncertain", property(lambda self: "consensus"))
+    monkeypatch.setattr(pilot, "consensus_may_pay", lambda *_: True)
     found = prt.precompute(grey_scene, LIGHTING, max_depth=2, target_error=target, progress=False)
     consensus, exact = (
         prt.precompute(grey_scene, LIGHTING, Plan(how), max_depth=2, progress=False)
@@ -565,7 +567,7 @@ def test_predicted_consensus_is_that_of_meshes_that_fit_into_a_patch(grey_scene)
     assert of_whole == pytest.approx(share * true, rel=0.02)
 
 
-def test_predicted_errors_are_those_of_the_matrix():
+def test_predicted_errors_are_those_of_the_matrix(monkeypatch):
     """Paths, coarse and fine, and gathered light: the error that held-out elements estimate, within its noise.
 
     Expected: the pilot's 192 vertices and the check's elements know it within some percent each. Predicted over
@@ -575,6 +577,7 @@ def test_predicted_errors_are_those_of_the_matrix():
     """
     scene, lighting = build(0.25, **still_life(GREY)), prt.CubemapLighting(8)
     direct = DirectSolver(problem_at(scene, lighting))
+    monkeypatch.setattr(pilot, "_too_dear", lambda *_: False)
     costs = measure(direct, Settings(8, target_error=0.04), indirect=True)
     assert costs.paths is not None and costs.gather is not None
     plans = [
@@ -586,6 +589,41 @@ def test_predicted_errors_are_those_of_the_matrix():
         found = prt.precompute(scene, lighting, plan, progress=False).report["estimated_error"]["total"]
         print(f"{plan.indirect}: predicted {predicted:.3%}, estimated {found:.3%}")
         assert predicted / found == pytest.approx(mean, abs=3 * deviation)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "seconds", "pays"),
+    [
+        (64_000, 2.5, True),  # the bunny, n = 16: 0.3 s to measure, 1 s saved
+        (17_700, 0.5, False),  # terrace, n = 16: 0.57 s to measure
+        (17_700, 4.0, True),
+        (PATCH * PATCHES, 100.0, False),  # patches would be all of it
+    ],
+)
+def test_consensus_is_measured_where_it_may_save_more(vertices, seconds, pays):
+    direct = SimpleNamespace(
+        points=range(vertices),
+        problem=SimpleNamespace(scene=SimpleNamespace(sampled_together=(slice(0, 1),))),
+    )
+    assert consensus_may_pay(direct, DirectCost(seconds, 0.0)) == pays
+
+
+@pytest.mark.parametrize(("slower", "timed"), [(1.0, True), (1e4, False)])
+def test_paths_are_timed_where_they_may_be_quicker(grey_scene, monkeypatch, slower, timed):
+    """Of single elements they are timed in any case: gathering that is quicker than a third of that leaves no doubt."""
+    rows, paths = [], PilotElements.paths
+    monkeypatch.setattr(pilot, "seconds_of_a_path", lambda *_: rows.append(1) or 1e-6)
+
+    def slow(self, *arguments):
+        found = paths(self, *arguments)
+        return replace(found, seconds=slower * found.seconds)
+
+    monkeypatch.setattr(PilotElements, "paths", slow)
+    direct = DirectSolver(problem_at(grey_scene, LIGHTING))
+    costs = measure(direct, Settings(4, target_error=0.1), indirect=True)
+    assert len(rows) == timed
+    assert (costs.paths.seconds[4] == 1e-6) == timed
+    assert (costs.sparse.path == 1e-6) == timed
 
 
 @pytest.mark.parametrize("indirect", [True, False])
@@ -617,12 +655,13 @@ def test_errors_of_direct_light_are_parts_of_those_of_all(grey_scene):
 
 
 @pytest.mark.filterwarnings("error", "ignore:.*faces point inwards")
-def test_a_room_without_light():
+def test_a_room_without_light(monkeypatch):
     """Nothing to gather in a closed room: no rank, no error, and no division by it."""
     room = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*GREY[0])}
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": diffuse(*GREY[0])}
     scene = build(0.5, room=room, box=box)
     direct = DirectSolver(problem_at(scene, LIGHTING, max_depth=4))
+    monkeypatch.setattr(pilot, "consensus_may_pay", lambda *_: True)
     costs = measure(direct, Settings(4, max_depth=4), indirect=True)
     assert costs.gather is not None
     assert costs.gather.rank(0.03) == costs.gather.error(64, 0.06) == 0
