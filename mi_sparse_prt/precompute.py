@@ -219,7 +219,8 @@ class _Attempts:
         parts, plan = self._evaluated(first)
         transport = matrix_of(problem, parts)
         with run.clock.phase("held_out"):
-            error = held_out_error(problem, transport, run.seed, indirect=self._dark is None)
+            indirect, certain = self._dark is None, self._certain(plan)
+            error = held_out_error(problem, transport, run.seed, indirect=indirect, certain=certain)
         ended = self._specular is not None and self._specular.ended
         _warn_if_missed(error, self._settings, self._proposals.too_long, ended)
         _warn_of_specular_noise(parts.specular, error, self._settings)
@@ -272,7 +273,7 @@ class _Attempts:
         if isinstance(proposals, RefinementSchedule) or (how := proposals.uncertain) is None:
             return []
         parts = self._execution.direct_light(Plan(how))
-        proposals.choose_again(how, self._judged(parts, 0, None, indirect=False).total)
+        proposals.choose_again(how, self._judged(parts, Plan(how), 0, None, indirect=False).total)
         return [parts]
 
     def _evaluated(self, before: list[MethodResult]) -> tuple[MethodResult, Plan]:
@@ -285,10 +286,10 @@ class _Attempts:
         attempts.append(self._execution.parts(proposals.plan))
         plans = [proposals.plan] * len(attempts)
         if target is None:
-            return self._finished(attempts, -1), plans[-1]
+            return self._finished(attempts, plans, -1), plans[-1]
         judged: list[HeldOutError | None] = [None] * len(before)
         while True:
-            found = proposals.weighed(self._judged(attempts[-1], len(attempts), target))
+            found = proposals.weighed(self._judged(attempts[-1], plans[-1], len(attempts), target))
             judged.append(found)
             if found.total <= target or found.dark:
                 break
@@ -304,27 +305,37 @@ class _Attempts:
             attempts.append(self._execution.parts(proposals.plan, kept))
             plans.append(proposals.plan)
         best = int(np.argmin([math.inf if found is None else found.total for found in judged]))
-        return self._finished(attempts, best, judged[best]), plans[best]
+        return self._finished(attempts, plans, best, judged[best]), plans[best]
+
+    def _certain(self, plan: Plan) -> bool:
+        """Whether its direct light is made of the rays that judge it: those to texels' centres."""
+        return plan.direct == "exact" and self._problem.basis == "direction"
 
     def _judged(
-        self, parts: MethodResult, attempt: int, target: float | None, indirect: bool = True
+        self, parts: MethodResult, plan: Plan, attempt: int, target: float | None, indirect: bool = True
     ) -> HeldOutError:
         """The error of an attempt, by elements of its own, with as little noise of specular light as there will be."""
-        indirect = indirect and self._dark is None
+        indirect, certain = indirect and self._dark is None, self._certain(plan)
         with self._run.clock.phase("held_out"):
             stream = random_stream(self._run.seed, DECISION, attempt)
             transport = matrix_of(self._problem, parts)
-            found = held_out_error(self._problem, transport, stream, target, indirect=indirect)
+            found = held_out_error(
+                self._problem, transport, stream, target, indirect=indirect, certain=certain
+            )
         return found if self._specular is None else self._specular.foreseen(found)
 
     def _finished(
-        self, attempts: list[MethodResult], which: int, found: HeldOutError | None = None
+        self,
+        attempts: list[MethodResult],
+        plans: list[Plan],
+        which: int,
+        found: HeldOutError | None = None,
     ) -> MethodResult:
         """One of the attempts, with as many rays of specular light as are worth it beside its error."""
         parts = _with_costs_of(attempts, which)
         if self._specular is None or self._specular.done:
             return parts
-        found = found or self._judged(parts, len(attempts), TARGET)
+        found = found or self._judged(parts, plans[which], len(attempts), TARGET)
         with self._run.clock.phase("specular"):
             self._specular.refine(found, self._time_left())
             light = self._specular.light

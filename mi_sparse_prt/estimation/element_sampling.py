@@ -24,6 +24,7 @@ FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this 
 AROUND = 24  # texels: 5 x 5 without the middle
 NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
 BELOW_HORIZON = 0.25  # added to the cosine where direct light is not bits alone: it may be wrong there, too
+CERTAIN = 16  # times fewer elements tell a norm
 FEW = 8  # times fewer elements in that case: hardly one is without an error
 
 POOL = 8  # times as many, of which these are drawn
@@ -56,6 +57,8 @@ class Effort:
         Rows for light by way of mirrors and glass, of all meshes together.
     specular_strata : int
         Rays for these, in each of four estimates: strata per axis of a part of the hemisphere.
+    certain : bool
+        Whether direct light is of the very rays that judge it, as ``held_out_error`` is told.
     """
 
     rays: float = 0.002
@@ -67,10 +70,12 @@ class Effort:
     strata: int = 4
     specular: int = 128
     specular_strata: int = 4
+    certain: bool = False
 
     def rays_of(self, total: int, n_meshes: int) -> float:
         """How many elements of a mesh, one of ``n_meshes``, are drawn for direct light that is bits, about."""
-        return max(self.rays * total, min(total / 4, self.fewest_rays * _share(n_meshes)))
+        count = max(self.rays * total, min(total / 4, self.fewest_rays * _share(n_meshes)))
+        return count / CERTAIN if self.certain else count
 
     def paths_of(self, total: int, n_meshes: int, part: float = 1.0) -> int:
         """How many elements of a mesh, one of ``n_meshes``, that has so many are drawn for indirect light, about."""

@@ -48,7 +48,7 @@ def held_out_lamp_error(problem: Problem, transport: LightTransport, seed: int) 
     x, y = (_true(problem, asked, seen, *pair) for pair in (seeds[:2], seeds[2:]))
     power = albedo[asked[0]] ** 2
     sums = ((power * a * b).sum(axis=1) for a, b in ((ours - x.light, ours - y.light), (x.all, y.all)))
-    columns = weights, *(column[:, None] for column in sums), shares.ravel()[elements]
+    columns = weights, *(column[:, None] for column in sums), shares.ravel()[elements], np.ones(len(weights))
     ends = np.cumsum([len(one) for one, _ in drawn])[:-1]
     parts = [Sample(*some) for some in zip(*(np.split(column, ends) for column in columns), strict=True)]
     return estimate_errors(

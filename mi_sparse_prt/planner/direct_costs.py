@@ -33,7 +33,7 @@ EDGES_TIMED = 16  # times the points of a pilot
 COMPILED = 16  # points for which kernels are compiled, before others are timed
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
 SAVED = 0.5  # of all rays, by consensus; about as much as it ever saves
-BEGUN = 0.2  # seconds of a pilot's consensus beside its rays
+BEGUN = 0.4  # seconds of a pilot's consensus beside its rays
 
 
 def negligible_beside(others: float) -> float:

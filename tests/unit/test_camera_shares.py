@@ -128,6 +128,6 @@ def test_nothing_is_said_of_what_is_dark():
     for light, told in ((1.0, 0.1), (1e-4, None)):
         norms = light + 0.01 * rng.standard_normal(n)
         squares = 0.01 * light + 1e-3 * rng.standard_normal(n)
-        sample = Sample(np.ones(n), squares[:, None], norms[:, None], np.ones(n))
+        sample = Sample(np.ones(n), squares[:, None], norms[:, None], np.ones(n), np.ones(n))
         found = estimate_errors({("floor", "direct"): sample}).seen
         assert found == (None if told is None else pytest.approx(told, rel=0.05))
