@@ -20,6 +20,7 @@ from mi_sparse_prt.operators.mean_cosine import MeanCosine
 from mi_sparse_prt.operators.upsampled import Upsampled
 from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.solvers.direct_rays import BITS
+from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.solvers.problem import Problem
 from mi_sparse_prt.transport import LightTransport
 
@@ -204,6 +205,25 @@ def test_rays_that_judge_themselves(exact):
     known = held_out_error(scene, flipped(transport, 50, 1), 2, 0)
     assert wrong["total"] > 0.05
     assert abs(wrong["total"] - known["total"]) < 3 * wrong["standard_error"]["total"]
+
+
+@pytest.mark.parametrize(("noise", "finer"), [(0.1, False), (20.0, True)])
+def test_where_noise_hides_the_error_there_are_more_paths(grey_scene, monkeypatch, noise, finer):
+    """Expected: four times the paths where their noise hides the error, and no more elsewhere."""
+    transport = prt.precompute(grey_scene, LIGHTING, Plan("exact", "gather", 64, 0.06), progress=False)
+    asked, elements = [], PathSolver.elements
+
+    def noisy(self, *where):
+        asked.append(self.spp)
+        found = elements(self, *where)
+        spread = noise * found.mean.mean() / np.sqrt(self.spp)
+        wrong = spread * np.random.default_rng(len(asked)).standard_normal(found.mean.shape)
+        return replace(found, mean=found.mean + wrong.astype(np.float32), variance=found.variance + spread**2)
+
+    monkeypatch.setattr(PathSolver, "elements", noisy)
+    report = held_out_error(grey_scene, transport, 5, 0, effort=Effort(spp=128))
+    assert asked == ([128, 512] if finer else [128])
+    print(report["total"], report["standard_error"]["total"])
 
 
 def test_a_seed_is_a_choice(exact):
