@@ -53,6 +53,7 @@ def test_the_peak_is_forecast(plan):
     assert 1 / 1.5 < forecast / peak < 1.5
 
 
+@pytest.mark.usefixtures("usual_held_out")
 def test_next_attempts_have_room(monkeypatch):
     """
     Rationale: each attempt of a target error has more rays than the one before, and form factors of all of them.
