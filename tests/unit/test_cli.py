@@ -155,7 +155,10 @@ def test_json_on_stdout_is_alone_there(folder, scene):
 
 
 def test_target_error_is_passed_on(folder, scene):
-    """Expected: the pilot's plans are in the report, and the parameters are those of the chosen one."""
+    """Expected: the pilot's plans are in the report, and the parameters are those of one that was carried out.
+
+    The first is aimed just below the target; one more follows where it turns out above.
+    """
     result = call(
         "precompute",
         scene,
@@ -170,8 +173,9 @@ def test_target_error_is_passed_on(folder, scene):
     assert result.exit_code == 0
     report = json.loads((folder / "t.json").read_text())
     assert report["parameters"]["target_error"] == 0.2
-    (chosen,) = (plan for plan in report["plans"] if plan["chosen"])
-    assert report["parameters"]["spp"] == chosen["parameters"]["spp"]
+    chosen = [plan["parameters"]["spp"] for plan in report["plans"] if plan["chosen"]]
+    assert 1 <= len(chosen) <= 2
+    assert report["parameters"]["spp"] in chosen
     assert "target" in result.stdout
 
 
