@@ -286,7 +286,7 @@ class _Attempts:
         attempts.append(self._execution.parts(proposals.plan))
         plans = [proposals.plan] * len(attempts)
         if target is None:
-            return self._finished(attempts, plans, -1), plans[-1]
+            return self._finished(attempts, -1, plans[-1]), plans[-1]
         judged: list[HeldOutError | None] = [None] * len(before)
         while True:
             found = proposals.weighed(self._judged(attempts[-1], plans[-1], len(attempts), target))
@@ -305,7 +305,7 @@ class _Attempts:
             attempts.append(self._execution.parts(proposals.plan, kept))
             plans.append(proposals.plan)
         best = int(np.argmin([math.inf if found is None else found.total for found in judged]))
-        return self._finished(attempts, plans, best, judged[best]), plans[best]
+        return self._finished(attempts, best, plans[best], judged[best]), plans[best]
 
     def _certain(self, plan: Plan) -> bool:
         """Whether its direct light is made of the rays that judge it: those to texels' centres."""
@@ -327,15 +327,15 @@ class _Attempts:
     def _finished(
         self,
         attempts: list[MethodResult],
-        plans: list[Plan],
         which: int,
+        plan: Plan,
         found: HeldOutError | None = None,
     ) -> MethodResult:
         """One of the attempts, with as many rays of specular light as are worth it beside its error."""
         parts = _with_costs_of(attempts, which)
         if self._specular is None or self._specular.done:
             return parts
-        found = found or self._judged(parts, plans[which], len(attempts), TARGET)
+        found = found or self._judged(parts, plan, len(attempts), TARGET)
         with self._run.clock.phase("specular"):
             self._specular.refine(found, self._time_left())
             light = self._specular.light

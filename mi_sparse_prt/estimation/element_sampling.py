@@ -24,8 +24,8 @@ FAR_FROM_EDGES = 0.2  # of the elements drawn where all bits around agree, this 
 AROUND = 24  # texels: 5 x 5 without the middle
 NEAR_EDGES = 0.08  # of the elements; only to plan how many to draw
 BELOW_HORIZON = 0.25  # added to the cosine where direct light is not bits alone: it may be wrong there, too
-CERTAIN = 16  # times fewer elements tell a norm
 FEW = 8  # times fewer elements in that case: hardly one is without an error
+CERTAIN = 16  # times fewer elements where none can be wrong: they find a norm
 
 POOL = 8  # times as many, of which these are drawn
 EVEN = 0.2  # of them drawn without regard to the light that the matrix has there

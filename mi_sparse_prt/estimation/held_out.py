@@ -45,14 +45,13 @@ Doubles = NDArray[np.float64]
 
 ROUNDING = 1e-5  # relative errors below are those of float32
 HELD_OUT = 1  # spawn key
+PARTS = ("direct", "indirect", "specular")
 BATCH = 1 << 20  # elements, evaluated together
 ROUND = 0.25  # of the elements: these mostly tell whether a target is met
 UNKNOWN = 0.5  # a standard error of what is seen, from which on nothing is said: next to no light is there
-UNSURE = 0.2  # of an error, or of one of 2%: a standard error from which on paths, where it is theirs, ...
-SMALL = 0.02
-MORE = (
-    4  # ... are so many times as many. Few are as good but where their noise is greater than what is judged
-)
+SMALL = 0.02  # an error that is to be known as well as a larger one
+UNSURE = 0.2  # of it: a standard error that asks for paths with less noise ...
+MORE = 4  # ... by so many times as many of them
 KNOWN = 0.1  # of a target: an error that is known so well, and still about the target, is left at that
 
 
@@ -182,7 +181,7 @@ def held_out_error(
         if _hidden_by_paths(samples):
             finer = replace(effort, spp=MORE * effort.spp)
             estimator = _Estimator(problem, transport, finer, stream, indirect, shares)
-            samples = estimator.samples(rng, 1.0)
+            samples |= estimator.samples(rng, 1.0, ("indirect",))
         return replace(estimate_errors(samples), dark=_squared_norm(samples) < DARK**2 * open_square)
     samples, rounds = {}, 0
     while rounds < round(1 / ROUND):
@@ -195,13 +194,11 @@ def held_out_error(
 
 
 def _hidden_by_paths(samples: Samples) -> bool:
-    """Whether what is judged is not known well, and most of that is the noise of indirect light's paths."""
+    """Whether an error is not known well, and most of that is the noise of indirect light's paths."""
     total, spread = _relative_of(samples)
-    of_paths, every = (
-        sum(_variance(s, total**2) for (_, part), s in samples.items() if part in parts)
-        for parts in (("indirect",), ("direct", "indirect", "specular"))
-    )
-    return spread > UNSURE * max(total, SMALL) and of_paths > every / 2
+    variances = {key: _variance(sample, total**2) for key, sample in samples.items()}
+    of_paths = sum(variance for (_, part), variance in variances.items() if part == "indirect")
+    return spread > UNSURE * max(total, SMALL) and of_paths > sum(variances.values()) / 2
 
 
 def seen_shares(problem: Problem) -> Doubles:
@@ -301,24 +298,25 @@ class _Estimator:
             self._term_rays = TermRays(self._rays, problem.reflection)
             self._term_paths = TermPaths(problem, effort.spp // 2, self._seeds[2])
 
-    def samples(self, rng: np.random.Generator, part: float) -> Samples:
-        """Elements of each mesh, for direct and for indirect light; drawn by mesh, evaluated together."""
+    def samples(self, rng: np.random.Generator, share: float, parts: Sequence[str] = PARTS) -> Samples:
+        """Such a share of the elements of each mesh, for parts of light; drawn by mesh, evaluated together."""
         chosen, normals = {}, self._problem.points.normals
         for mesh in self._transport.meshes:
-            place = mesh.vertices, rng, self._effort, part
-            chosen[mesh.name, "direct"] = for_direct_light(self._transport, normals, *place)
-            if self._any_indirect:
+            place = mesh.vertices, rng, self._effort, share
+            if "direct" in parts:
+                chosen[mesh.name, "direct"] = for_direct_light(self._transport, normals, *place)
+            if self._any_indirect and "indirect" in parts:
                 chosen[mesh.name, "indirect"] = for_indirect_light(self._transport, *place)
         found: Samples = {}
         for keys in self._batches(chosen):
             some = [chosen[key] for key in keys]
             whole = (self.direct if keys[0][1] == "direct" else self.indirect)(_joined(some))
             ends = np.cumsum([len(each.weights) for each in some])[:-1]
-            parts = zip(*(np.split(part, ends) for part in vars(whole).values()), strict=True)
-            found |= {key: Sample(*part) for key, part in zip(keys, parts, strict=True)}
+            columns = zip(*(np.split(column, ends) for column in vars(whole).values()), strict=True)
+            found |= {key: Sample(*own) for key, own in zip(keys, columns, strict=True)}
         found = {key: found[key] for key in chosen}
-        if "specular" in self._transport.operators:
-            found |= self._specular(rng, part)
+        if "specular" in parts and "specular" in self._transport.operators:
+            found |= self._specular(rng, share)
         return found
 
     def _specular(self, rng: np.random.Generator, part: float) -> Samples:
@@ -416,9 +414,8 @@ class _Estimator:
         found = []
         for first, second in (errors, values):
             own = first * second - variance  # [element, row, channel]
-            of_rows = np.einsum(
-                "mrc->mr", np.broadcast_to(own, (*own.shape[:2], 3))
-            )  # one channel stands for three
+            colours = np.broadcast_to(own, (*own.shape[:2], 3))  # one channel stands for three
+            of_rows = np.einsum("mrc->mr", colours)
             found.append(np.column_stack([_quadratic(gram, first, second, own), of_rows]))
         squares, norms = found
         shares = self._shares[chosen.vertices]

@@ -32,7 +32,7 @@ PATCHES_DRAWN = 3  # spawn key
 EDGES_TIMED = 16  # times the points of a pilot
 COMPILED = 16  # points for which kernels are compiled, before others are timed
 OVERHEAD = 12e-6  # seconds per vertex that consensus takes beside its rays
-SAVED = 0.5  # of all rays, by consensus; about as much as it ever saves
+SAVED = 0.5  # of all rays, as consensus is taken to do before it is measured
 BEGUN = 0.4  # seconds of a pilot's consensus beside its rays
 
 
@@ -151,8 +151,9 @@ def points_at(points: Points, ids: NDArray[np.integer]) -> Points:
 
 
 def consensus_may_pay(direct: DirectSolver, exact: DirectCost) -> bool:
-    """Whether consensus may save more than it takes to find out, by all rays at the vertices of patches."""
-    measured = PATCH * max(PATCHES, len(direct.problem.scene.sampled_together)) / len(direct.points)
+    """Whether consensus may save more than it takes to find out, by rays of patches, and all of those inside them."""
+    patches = max(PATCHES, len(direct.problem.scene.sampled_together))
+    measured = patches * PATCH * (1 - SAVED + 1 / INNER) / len(direct.points)
     return exact.seconds * (SAVED - measured) > BEGUN
 
 

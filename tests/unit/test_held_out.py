@@ -207,6 +207,26 @@ def test_rays_that_judge_themselves(exact):
     assert abs(wrong["total"] - known["total"]) < 3 * wrong["standard_error"]["total"]
 
 
+def test_few_of_the_rays_that_judge_themselves_tell_as_much(exact):
+    """Expected: squared norms and errors of a sixteenth of the elements are those of all, on average; 2% would show."""
+    scene, right = exact
+    wrong = flipped(right, 5, 1)
+    rows = [matrix.rows(np.arange(scene.n_vertices)).astype(np.float64) for matrix in (right, wrong)]
+    truth = np.array([np.square(rows[0] - rows[1]).sum(), np.square(rows[0]).sum()])
+    problem = Problem(scene, right.emission, mesh_vertices(scene), Diffuse(scene.albedo), "direction", 2)
+    shares, stream = np.zeros(scene.n_vertices), np.random.SeedSequence(3)
+    estimator = held_out._Estimator(problem, wrong, Effort(certain=True), stream, False, shares)
+    found = []
+    for seed in range(200):
+        every = estimator.samples(np.random.default_rng(seed), 1.0).values()
+        sums = [(s.weights @ s.squares[:, 0], s.weights @ s.norms[:, 0]) for s in every]
+        found.append(np.sum(sums, axis=0) / truth)
+    mean, spread = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+    print(mean, spread)
+    assert (spread < 0.005).all()
+    assert (abs(mean - 1) < 4 * spread).all()
+
+
 @pytest.mark.parametrize(("noise", "finer"), [(0.1, False), (20.0, True)])
 def test_where_noise_hides_the_error_there_are_more_paths(grey_scene, monkeypatch, noise, finer):
     """Expected: four times the paths where their noise hides the error, and no more elsewhere."""
