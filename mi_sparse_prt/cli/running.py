@@ -96,6 +96,7 @@ class Command:
         def watch() -> None:
             while not finished.is_set():
                 if os.read(reader, 1)[0] == signal.SIGINT and not finished.wait(GRACE):
+                    print(file=sys.stderr)  # a progress bar or the terminal's ^C stands in the line
                     _complain(self.interrupted())
                     os._exit(INTERRUPTED)
 
