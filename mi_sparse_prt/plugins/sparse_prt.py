@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from pathlib import Path
 
@@ -11,16 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_sparse_prt.cache import cached_precompute
-from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError
+from mi_sparse_prt.core.errors import LampWarning, NotDiffuseWarning, PrtError, PrtWarning
 from mi_sparse_prt.emission.cubemap import CubemapLighting
 from mi_sparse_prt.emission.unit_lamps import UnitLamps
-from mi_sparse_prt.methods.settings import AUTO_TERMS, Settings
+from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.relighting.followed_rays import surfaces_to_follow
 from mi_sparse_prt.relighting.image import GlossyRelitScene, RelitIntegrator, RelitScene
 from mi_sparse_prt.relighting.lamps_at_pixels import LampLitIntegrator
+from mi_sparse_prt.relighting.picture_error import picture_error
 from mi_sparse_prt.relighting.sharp_light import sharp_light
 from mi_sparse_prt.scene.scene import Scene
+from mi_sparse_prt.transport import LightTransport
 
+COMPARED = 0.1  # of the time that a picture's matrices take, to find out whether it is right
 _UNSEEN = "DirectionalArea"  # no path from a camera finds its light, those of ``path`` neither
 
 
@@ -48,6 +52,10 @@ class SparsePRT(mi.SamplingIntegrator):
     ``mi.traverse`` and ``update`` on the environment, or on how bright a lamp is (``radiance.value``,
     ``intensity.value``, ``irradiance.value``, ``scale``), relight; no matrix is computed again. A lamp that moved,
     turned or has another texture needs the matrix of lamps again; other geometry or materials need both.
+
+    The error of a matrix is that of all light that may come. Where what the camera sees may be farther off than was
+    asked for, the first picture is compared with a few samples of ``path``, and a warning tells by how much it is off
+    in the light that there is.
 
     Films, crop windows, samplers, the alpha channel and ``hide_emitters`` are those of ``path``. An ``aov`` integrator
     may be put around this one; it then relights twice.
@@ -125,6 +133,8 @@ class SparsePRT(mi.SamplingIntegrator):
         self._cache = Path(cache) if cache else None
         self._progress = props.get("progress", True)
         self._use_reference = props.get("reference", False)
+        self._doubtful: mi.Scene | None = None  # one to compare with path in, where that is needed
+        self._compared = False
         self._hide_emitters = props.get("hide_emitters", False)
         nested = [value for _, value in props.objects() if isinstance(value, mi.Integrator)]
         usual = {"max_depth": self._settings["max_depth"], "hide_emitters": self._hide_emitters}
@@ -146,7 +156,15 @@ class SparsePRT(mi.SamplingIntegrator):
         PrtError
             If the scene has no light, or cannot be used (see ``prt.load_scene``, ``prt.precompute``).
         """
-        return self._looking_at(scene).render(scene, sensor, seed, spp, develop, evaluate)
+        begin = time.perf_counter()
+        integrator = self._looking_at(scene)
+        if self._doubtful is not None and not self._compared:
+            self._compared = True
+            camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            seconds = COMPARED * (time.perf_counter() - begin)
+            both = integrator, self._reference
+            _warn_if_off(picture_error(*both, self._doubtful, camera, self._target, seconds), self._target)
+        return integrator.render(scene, sensor, seed, spp, develop, evaluate)
 
     def sample(
         self,
@@ -171,33 +189,43 @@ class SparsePRT(mi.SamplingIntegrator):
                 "sparse_prt: the scene has no light; add an emitter: envmap, constant, area, point ..."
             )
         surfaces = _read(scene, self._edge_length, self._settings["terms"] == AUTO_TERMS)
-        relit = self._relit(surfaces, scene.environment(), lamps)
-        depth = self._settings["max_depth"]
+        relit, doubtful = self._relit(surfaces, scene.environment(), lamps)
+        # shapes as they are, but for copies: rays that meet instances take long
+        copies = any(shape.class_name() == "Instance" for shape in scene.shapes())
+        lit = surfaces.mitsuba if copies else scene
+        self._doubtful = lit if doubtful else None
         if lamps:
-            # shapes as they are, but for copies: rays that meet instances take long
-            copies = any(shape.class_name() == "Instance" for shape in scene.shapes())
-            lit = surfaces.mitsuba if copies else scene
+            depth = self._settings["max_depth"]
             return LampLitIntegrator(relit, lit, depth, self._hide_emitters, copies)
         return RelitIntegrator(relit, self._hide_emitters)
 
-    def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> RelitScene:
-        """All light but that which lamps send to the camera directly or after one reflection."""
+    @property
+    def _target(self) -> float:
+        return self._settings["target_error"] or TARGET
+
+    def _relit(self, surfaces: Scene, environment: mi.Emitter | None, lamps: bool) -> tuple[RelitScene, bool]:
+        """All light but that which lamps send to the camera directly or after one reflection.
+
+        Second, whether the environment's may be farther off, in what cameras see, than was asked for.
+        """
         irradiance = np.zeros((1, surfaces.n_vertices, 3), np.float32)
         depth = self._settings["max_depth"]
         if lamps and depth != 2:
             irradiance = self._light_of_lamps(surfaces)
         followed = surfaces_to_follow(surfaces) if self._settings["terms"] else []
         if environment is None:
-            return RelitScene(surfaces, irradiance, None, None, depth, followed)
+            return RelitScene(surfaces, irradiance, None, None, depth, followed), False
         transport = cached_precompute(surfaces, self._lighting, self._cache, self._progress, **self._settings)
         sharp = sharp_light(environment)
+        doubtful = _is_doubtful(transport, self._target)
         if not transport.terms:
             found = transport.irradiance_by_depth(environment)
             found = found if sharp is None else sharp.taken_from(found, transport)
             emitter = None if sharp is None else sharp.emitter
-            return RelitScene(surfaces, irradiance + found, environment, None, depth, followed, emitter)
+            relit = RelitScene(surfaces, irradiance + found, environment, None, depth, followed, emitter)
+            return relit, doubtful
         others = irradiance if lamps else None
-        return GlossyRelitScene(surfaces, transport, environment, environment, sharp, others)
+        return GlossyRelitScene(surfaces, transport, environment, environment, sharp, others), doubtful
 
     def _light_of_lamps(self, surfaces: Scene) -> NDArray[np.float32]:
         """Irradiance / pi (k, n_v, 3) of light of lamps that met some, and at most 0, 1, ... surfaces; k may be 1."""
@@ -224,6 +252,23 @@ def _read(scene: mi.Scene, edge_length: float | None, shaded: bool) -> Scene:
         if shaded:
             warnings.simplefilter("ignore", NotDiffuseWarning)
         return Scene.from_mitsuba(scene, edge_length)
+
+
+def _is_doubtful(transport: LightTransport, target: float) -> bool:
+    """Whether what cameras see is certainly farther off than a target, each element by itself."""
+    error = transport.report.get("estimated_error", {})
+    return "seen" in error and error["seen"] - 2 * error["standard_error"]["seen"] > target
+
+
+def _warn_if_off(error: float, target: float) -> None:
+    """Say so if a picture is certainly farther off than a target."""
+    if error > target:
+        warnings.warn(
+            f"in this light the picture is {error:.1%} off or more, as a few samples of path tell: a smaller target_error "
+            "or edge_length, or a larger resolution, helps",
+            PrtWarning,
+            stacklevel=4,
+        )
 
 
 def _has_lamps(scene: mi.Scene) -> bool:
