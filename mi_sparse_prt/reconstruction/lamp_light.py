@@ -6,6 +6,7 @@ are no part of the result, tell how noisy they are at each node, and which lamps
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -141,12 +142,17 @@ class LampLight:
         least, few = np.full(self._shape[1], self._spp), self._seen[0]
         for lamp in range(len(least)):
             enough = target**2 * float(self._power @ whole[:, lamp])
-            noise = {0: self._variance(lamp, few, self._first_split(lamp))} if few >= ENOUGH else {}
-            steps = 2 ** np.arange(int(np.log2(self._spp)))
-            noise |= {int(k): self._variance(lamp, SHARED * k, self._split[lamp]) for k in steps}
-            met = [k for k, own in noise.items() if 0 < self._power @ (own * left[:, lamp]) <= enough]
-            least[lamp] = min(met, default=self._spp)
+            first = self._left(lamp, few, self._first_split(lamp), left) if few >= ENOUGH else 0.0
+            one = self._left(lamp, SHARED, self._split[lamp], left)
+            if 0 < first <= enough:
+                least[lamp] = 0
+            elif 0 < one < enough * self._spp:
+                least[lamp] = math.ceil(one / enough)
         return least
+
+    def _left(self, lamp: int, effort: float, split: float, share: Doubles) -> float:
+        """Squared noise, of which smoothing leaves a share (n, m), see ``_variance``."""
+        return float(self._power @ (self._variance(lamp, effort, split) * share[:, lamp]))
 
     def _first_split(self, lamp: int) -> float:
         """Whether the first paths or the first photons have less noise."""

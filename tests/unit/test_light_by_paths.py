@@ -278,6 +278,25 @@ def test_a_few_first_paths_are_no_result(problem, monkeypatch):
         assert (light.effort(100.0) == least).all()
 
 
+def test_paths_are_as_many_as_a_target_takes(problem, monkeypatch):
+    """Rationale: half of the time of a staircase of lamps are paths; the next power of two is a third too many.
+
+    Expected: paths that are predicted to leave so much noise are in inverse proportion to its square, but for rounding
+    up, where they are neither as few as the first ones nor as many as there are at most.
+    """
+    n = problem.scene.n_vertices
+    nodes, levels = Nodes(np.arange(n), None), smoothing_levels(problem.scene, problem.points)
+    monkeypatch.setattr(lamp_light, "ENOUGH", 1 << 20)  # first ones are no result
+    light = LampLight(problem, nodes.ids, nodes, levels, 1 << 10, 3, 1)
+    targets = np.geomspace(0.04, 0.2, 5)
+    efforts = np.array([light.effort(float(target)) for target in targets])
+    print(efforts)
+    assert ((efforts > 4) & (efforts < 1 << 10)).sum() >= 6
+    expected = efforts[:-1] * (targets[:-1] / targets[1:])[:, None] ** 2
+    known = efforts[:-1] < 1 << 10
+    assert (abs(efforts[1:] - expected)[known] <= 1).all()
+
+
 def test_many_vertices_take_their_light_from_nodes(monkeypatch):
     """Rationale: only nodes have paths where there are many vertices; a lit corner with a wall of plastic.
 
