@@ -264,8 +264,8 @@ def _warn_if_off(error: float, target: float) -> None:
     """Say so if a picture is certainly farther off than a target."""
     if error > target:
         warnings.warn(
-            f"in this light the picture is {error:.1%} off or more, as a few samples of path tell: a smaller target_error "
-            "or edge_length, or a larger resolution, helps",
+            f"in this light the picture is {error:.1%} off or more, as a few samples of path tell: a smaller "
+            "target_error or edge_length, or a larger resolution, helps",
             PrtWarning,
             stacklevel=4,
         )

@@ -24,6 +24,7 @@ from mi_sparse_prt.core.errors import PrtError, PrtWarning
 from mi_sparse_prt.core.random_keys import hash_rows, mix
 from mi_sparse_prt.scene.materials import Material
 from mi_sparse_prt.scene.mitsuba_meshes import build_mitsuba_mesh, build_mitsuba_scene, objects_off_shapes
+from mi_sparse_prt.scene.opaque_parts import opaque_part
 from mi_sparse_prt.scene.shape_table import ShapeTable
 from mi_sparse_prt.scene.sheets import Back, find_backs
 from mi_sparse_prt.scene.sizing_field import Details
@@ -389,22 +390,32 @@ class Scene:
 
     @cached_property
     def blocking_surfaces(self) -> TracedScene | None:
-        """Those of ``unsplit`` that no light goes straight through."""
-        return self._unsplit_surfaces(lambda material: not material.passes_straight)
+        """Those of ``unsplit`` that no light goes straight through, and opaque parts of others."""
+        return self._unsplit_surfaces(lambda material: not material.passes_straight, self._opaque_parts)
 
     @cached_property
     def dimming_surfaces(self) -> TracedScene | None:
         """Those of ``unsplit`` past which no light is as it was: ``blocking_surfaces``, and panes."""
-        return self._unsplit_surfaces(lambda material: not material.passes_straight or material.dims)
+        return self._unsplit_surfaces(
+            lambda material: not material.passes_straight or material.dims, self._opaque_parts
+        )
 
-    def _unsplit_surfaces(self, belongs: Callable[[Material], bool]) -> TracedScene | None:
-        """A scene of some surfaces of ``unsplit``, in the normalised frame; None for none."""
+    @cached_property
+    def _opaque_parts(self) -> list[mi.Mesh]:
+        """Triangles of ``unsplit`` under masks that certainly let no light pass there."""
+        return [part for shape in self.unsplit.shapes() if (part := opaque_part(shape)) is not None]
+
+    def _unsplit_surfaces(
+        self, belongs: Callable[[Material], bool], others: Sequence[mi.Mesh] = ()
+    ) -> TracedScene | None:
+        """A scene of some surfaces of ``unsplit`` and others, in the normalised frame; None for none."""
         which = [k for k, run in enumerate(self._runs) if belongs(self.materials[run.start])]
         shapes = self.unsplit.shapes()
-        if len(which) in (0, len(shapes)):
+        if not others and len(which) in (0, len(shapes)):
             return self.unsplit if which else None
         names = [self.fronts[self._runs[k].start].name for k in which]
-        return TracedScene(build_mitsuba_scene([shapes[k] for k in which], names))
+        names += [f"opaque part {k}" for k in range(len(others))]
+        return TracedScene(build_mitsuba_scene([*(shapes[k] for k in which), *others], names))
 
     @property
     def passes_straight(self) -> bool:

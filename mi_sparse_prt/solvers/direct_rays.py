@@ -26,6 +26,7 @@ from mi_sparse_prt.solvers.problem import Problem
 
 Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
 
+NOTHING = 1e-5  # of the light: rounding leaves as much of what an opacity of 1 lets pass
 ALL = 0.999  # of the light: what lets as much pass is not there
 
 SHARES = 1 << 31  # a random number's use, beyond those of strata
@@ -419,7 +420,9 @@ def pass_straight(
         flags = si.bsdf().flags()
         through = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (count < most)
         passed = measure(mi.Color3f(si.bsdf().eval_null_transmission(si, through)))
-        share = dr.select(active, dr.select(through, share * passed, 0), share)
+        onward = share * passed
+        onward = dr.select(dr.max(mi.Color3f(onward)) > NOTHING, onward, 0)
+        share = dr.select(active, dr.select(through, onward, 0), share)
         count += dr.select(through, 1, 0)
         boundary |= through & ((flags & scatters) == 0)
         ray = onwards(si)

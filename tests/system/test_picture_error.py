@@ -88,7 +88,12 @@ def test_what_is_said_is_how_far_the_picture_is_off(tmp_path, sun):
     path = mi.load_dict({"type": "path", "max_depth": 4})
     images = [
         np.array(mi.render(scene, integrator=how, spp=spp, seed=seed))
-        for how, spp, seed in ((integrator, 256, 11), (path, 1024, 12), (path, 1024, 13), (integrator, 256, 14))
+        for how, spp, seed in (
+            (integrator, 256, 11),
+            (path, 1024, 12),
+            (path, 1024, 13),
+            (integrator, 256, 14),
+        )
     ]
     error, uncertainty = relative_l2_without_noise(*images[:3], other_estimate=images[3])
     print(f"{error:.4f} {uncertainty:.4f}", sentences)
