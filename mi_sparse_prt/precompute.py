@@ -32,6 +32,7 @@ from mi_sparse_prt.methods.settings import AUTO_TERMS, TARGET, Settings
 from mi_sparse_prt.planner.candidates import CandidatePlans, RefinementSchedule, refinement_schedule
 from mi_sparse_prt.planner.choice import WORST_FACTOR, Costs, Predicted
 from mi_sparse_prt.planner.forecast import Forecast, beside_direct_light, fits, forecast
+from mi_sparse_prt.planner.memory import terms_fit
 from mi_sparse_prt.planner.pilot import measure
 from mi_sparse_prt.planner.specular_steps import SpecularSteps
 from mi_sparse_prt.reconstruction.senders import choose_senders
@@ -39,7 +40,7 @@ from mi_sparse_prt.reflection.reflection import Diffuse
 from mi_sparse_prt.reflection.surfaces import ChosenReflection, chosen_reflection, vertex_reflection
 from mi_sparse_prt.scene.scene import Scene
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
-from mi_sparse_prt.solvers.problem import Problem
+from mi_sparse_prt.solvers.problem import Problem, told_apart
 from mi_sparse_prt.solvers.refined_mean import ENOUGH
 from mi_sparse_prt.solvers.specular import SpecularLight
 from mi_sparse_prt.transport import LightTransport
@@ -363,8 +364,13 @@ def _reflection(scene: Scene, where: Measurement, settings: Settings) -> tuple[C
             bound = FACTOR_SHARE * (settings.target_error or TARGET)
             chosen = chosen_reflection(scene, bound)
             sending = chosen.sent or chosen.seen
-            if sending.terms:
+            apart = told_apart(settings.max_depth) if scene.specular else 0
+            if sending.terms and (settings.max_depth == 2 or terms_fit(sending, apart)):
                 return chosen, replace(settings, terms=sending.terms)
+            if sending.terms:
+                _warn_if_glossy(
+                    scene, "there is no memory for the terms of so many points; cameras' rays go on there"
+                )
         elif refusal is not None:
             _warn_if_glossy(scene, refusal)
         settings = replace(settings, terms=0)
@@ -518,7 +524,7 @@ def _check_time(expected: Forecast, max_seconds: float) -> None:
     if expected.seconds > max_seconds:
         raise PrtError(
             f"the matrix would take about {expected.seconds:.0f} s, more than max_seconds={max_seconds:g}: allow more, "
-            "or use fewer texels (resolution) or vertices (edge_length)"
+            "or use fewer texels (resolution) or vertices (edge_length, simpler meshes)"
         )
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import psutil
-
 from mi_sparse_prt.core.errors import PrtError
 from mi_sparse_prt.methods.execution import indirect_solver
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.methods.settings import Settings
-from mi_sparse_prt.planner.memory import peak_bytes
+from mi_sparse_prt.planner.memory import free_bytes, peak_bytes
 from mi_sparse_prt.planner.row_timing import seconds_per_row
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
@@ -72,7 +70,7 @@ def forecast(
     """
     light, more = _DIRECT[plan.direct], _INDIRECT[plan.indirect if indirect else "none"]
     paths = indirect_solver(direct.problem, settings.of(plan))
-    needed, available = peak_bytes(direct, paths, plan, indirect), _available()
+    needed, available = peak_bytes(direct, paths, plan, indirect), free_bytes()
     if needed > available:
         raise PrtError(
             f"the matrix needs {needed / 1e9:.1f} GB but {available / 1e9:.1f} GB are free; "
@@ -94,8 +92,4 @@ def beside_direct_light(seconds: float, plan: Plan, indirect: bool) -> float:
 def fits(direct: DirectSolver, settings: Settings, plan: Plan, indirect: bool) -> bool:
     """Whether there is memory for one more plan, beside what is known of those before; arguments as of ``forecast``."""
     paths = indirect_solver(direct.problem, settings.of(plan))
-    return peak_bytes(direct, paths, plan, indirect) <= _available()
-
-
-def _available() -> int:
-    return int(psutil.virtual_memory().available)
+    return peak_bytes(direct, paths, plan, indirect) <= free_bytes()

@@ -9,10 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 
 from mi_sparse_prt.methods.plan import Plan
 from mi_sparse_prt.reconstruction.node_placement import node_count
 from mi_sparse_prt.reflection.in_out_factors import InOutFactors
+from mi_sparse_prt.reflection.reflection import Reflection
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 from mi_sparse_prt.solvers.first_bounce import USUAL
 from mi_sparse_prt.solvers.form_factors import gather_matrix
@@ -35,6 +37,27 @@ class _Gathered(NamedTuple):
     hits: float
     entries: float
     weights: float = 0.0
+
+
+def free_bytes() -> int:
+    """Of memory, beside what the process has."""
+    return int(psutil.virtual_memory().available)
+
+
+def terms_fit(reflection: Reflection, depths_apart: int) -> bool:
+    """Whether there is memory for what glossy points send to each other, by whatever plan."""
+    rows = reflection.row_count * max(1, depths_apart)
+    return _drawn(rows) + _basis(rows, 0.0) <= free_bytes()
+
+
+def _drawn(rows: int) -> float:
+    """Bytes of columns of D that are added up, in pieces and in one, and times G."""
+    return 3.0 * 4 * rows * FIRST_COMBINATIONS
+
+
+def _basis(rows: int, rank: float) -> float:
+    """Bytes of a random basis."""
+    return 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)
 
 
 def peak_bytes(direct: DirectSolver, paths: PathSolver, plan: Plan, indirect: bool) -> float:
@@ -86,9 +109,7 @@ def _gathered(direct: DirectSolver, channels: int, plan: Plan) -> float:
     rows = reflection.row_count * max(1, direct.problem.depths_apart)  # each depth has rows of its own
     found = _rays_that_meet(direct, plan.rays)
     rank = min(RANK / plan.tolerance, USUAL.most, texels)
-    basis = 4 * rows * max(COMBINATIONS * rank, FIRST_COMBINATIONS)
-    # columns of D that are added up, in pieces and in one, and times G
-    drawn = 3 * 4 * rows * FIRST_COMBINATIONS
+    basis, drawn = _basis(rows, rank), _drawn(rows)
     if terms:
         colours = channels if channels == 1 else 3
         of_rays = found.hits * 4 * (6 + 1 + terms + colours * terms)

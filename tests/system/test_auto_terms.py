@@ -1,15 +1,18 @@
 """`terms="auto"`: glossy surfaces by as many factors as images need, everything else as it was."""
 
 import warnings
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
-from conftest import T, assert_same, build, diffuse, problem_at
+from conftest import PIPELINE, T, assert_same, build, diffuse, problem_at
 
 import mi_sparse_prt as prt
 from mi_sparse_prt.core.metrics import relative_l2_without_noise
 from mi_sparse_prt.methods.plan import Plan
+from mi_sparse_prt.planner.memory import terms_fit
 from mi_sparse_prt.solvers.paths import PathSolver
 from mi_sparse_prt.validation.mitsuba_reference import path_image
 
@@ -49,11 +52,13 @@ def scene_of(edge_length: float = 0.1, **shapes: dict) -> prt.Scene:
         return build(edge_length, ground=ground, sky=light, camera=CAMERA, **shapes)
 
 
-def image_error(scene: prt.Scene, *transports: prt.LightTransport) -> list[tuple[float, float]]:
+def image_error(
+    scene: prt.Scene, *transports: prt.LightTransport, spp: int = 64
+) -> list[tuple[float, float]]:
     """Of each matrix, the image's relative L2 beyond noise against ``path``, and what noise may show as one."""
     sensor, depth = scene.mitsuba.sensors()[0], transports[0].max_depth
     halves = [path_image(scene.mitsuba, sensor, depth, 2048, seed) for seed in (1, 2)]
-    pairs = [[prt.render(scene, t, sky(), spp=64, seed=seed) for seed in (3, 4)] for t in transports]
+    pairs = [[prt.render(scene, t, sky(), spp=spp, seed=seed) for seed in (3, 4)] for t in transports]
     return [relative_l2_without_noise(a, *halves, other_estimate=b) for a, b in pairs]
 
 
@@ -92,6 +97,32 @@ def test_rough_conductor():
     noises = [float(np.abs(a - b)[inside].mean()) for a, b in pairs]
     print("noise of rays and of factors", noises)
     assert noises[1] < 0.1 * noises[0]
+
+
+@pytest.mark.usefixtures("no_held_out")
+def test_rays_go_on_where_terms_have_no_room(monkeypatch):
+    """
+    Rationale: fifty copies of a plastic figure have a million vertices and ten rows each; pictures need none of these.
+    Expected: with a byte less than light between terms takes in any case, a matrix without terms and one warning; its
+        picture is within 1% of ``path``, beyond noise, as one with terms is. With that byte, terms.
+    """
+    scene = scene_of(0.15, ball=ball(0, BRUSHED))
+    terms = computed(scene, "auto")
+    assert terms.terms > 0
+    takes = (4 * 96 + 3 * 4 * 96) * terms.reflection.row_count
+    room = SimpleNamespace(available=takes)
+    with monkeypatch.context() as patch:
+        patch.setattr(psutil, "virtual_memory", lambda: room)
+        assert terms_fit(terms.reflection, 0)
+        room.available -= 1
+        assert not terms_fit(terms.reflection, 0)
+    monkeypatch.setattr(PIPELINE, "terms_fit", lambda *_: False)
+    with pytest.warns(prt.PrtWarning, match="no memory for the terms of so many points"):
+        found = computed(scene, "auto")
+    assert found.terms == 0
+    ((error, uncertainty),) = image_error(scene, found, spp=1024)
+    print(f"{error:.2%} (noise may show {uncertainty:.2%})")
+    assert uncertainty < 0.008 and error < 0.01
 
 
 @pytest.mark.filterwarnings("ignore::mi_sparse_prt.core.errors.PrtWarning")
