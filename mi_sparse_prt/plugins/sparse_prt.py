@@ -138,7 +138,8 @@ class SparsePRT(mi.SamplingIntegrator):
         self._hide_emitters = props.get("hide_emitters", False)
         nested = [value for _, value in props.objects() if isinstance(value, mi.Integrator)]
         usual = {"max_depth": self._settings["max_depth"], "hide_emitters": self._hide_emitters}
-        self._reference = nested[0] if nested else mi.load_dict({"type": "path", **usual})
+        self._path = mi.load_dict({"type": "path", **usual})
+        self._reference = nested[0] if nested else self._path
 
     def render(
         self,
@@ -162,7 +163,7 @@ class SparsePRT(mi.SamplingIntegrator):
             self._compared = True
             camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             seconds = COMPARED * (time.perf_counter() - begin)
-            both = integrator, self._reference
+            both = integrator, self._path
             _warn_if_off(picture_error(*both, self._doubtful, camera, self._target, seconds), self._target)
         return integrator.render(scene, sensor, seed, spp, develop, evaluate)
 

@@ -58,6 +58,10 @@ def by_few_paths(folder: Path) -> mi.Integrator:
             "edge_length": 0.1,
             "cache": str(folder / "cache"),
             "progress": False,
+            "reference_integrator": {
+                "type": "path",
+                "max_depth": 2,
+            },  # a choice of the user's, which plays no part
         }
     )
 
