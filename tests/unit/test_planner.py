@@ -608,9 +608,12 @@ def test_consensus_is_measured_where_it_may_save_more(vertices, seconds, pays):
     assert consensus_may_pay(direct, DirectCost(seconds, 0.0)) == pays
 
 
-@pytest.mark.parametrize(("slower", "timed"), [(1.0, True), (1e4, False)])
+@pytest.mark.parametrize(("slower", "timed"), [(1e-4, True), (1e4, False)])
 def test_paths_are_timed_where_they_may_be_quicker(grey_scene, monkeypatch, slower, timed):
-    """Of single elements they are timed in any case: gathering that is quicker than a third of that leaves no doubt."""
+    """Of single elements they are timed in any case: gathering that is quicker than a third of that leaves no doubt.
+
+    Those times are made far shorter or longer than they are: a busy machine measured them as too dear once.
+    """
     rows, paths = [], PilotElements.paths
     monkeypatch.setattr(pilot, "seconds_of_a_path", lambda *_: rows.append(1) or 1e-6)
 
