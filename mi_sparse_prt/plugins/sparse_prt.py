@@ -162,9 +162,9 @@ class SparsePRT(mi.SamplingIntegrator):
         if self._doubtful is not None and not self._compared:
             self._compared = True
             camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            seconds = COMPARED * (time.perf_counter() - begin)
-            both = integrator, self._path
-            _warn_if_off(picture_error(*both, self._doubtful, camera, self._target, seconds), self._target)
+            limit = COMPARED * (time.perf_counter() - begin)
+            error = picture_error(integrator, self._path, self._doubtful, camera, self._target, limit)
+            _warn_if_off(error, self._target)
         return integrator.render(scene, sensor, seed, spp, develop, evaluate)
 
     def sample(

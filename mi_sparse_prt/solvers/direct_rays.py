@@ -26,7 +26,7 @@ from mi_sparse_prt.solvers.problem import Problem
 
 Weights = Callable[[Any, Any], list[Any]]  # of points and directions (unit, world)
 
-NOTHING = 1e-5  # of the light: rounding leaves as much of what an opacity of 1 lets pass
+NOTHING = 1e-5  # of the light: rounding leaves less, 6e-8 or so, where the opacity is 1
 ALL = 0.999  # of the light: what lets as much pass is not there
 
 SHARES = 1 << 31  # a random number's use, beyond those of strata

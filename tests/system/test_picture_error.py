@@ -58,10 +58,8 @@ def by_few_paths(folder: Path) -> mi.Integrator:
             "edge_length": 0.1,
             "cache": str(folder / "cache"),
             "progress": False,
-            "reference_integrator": {
-                "type": "path",
-                "max_depth": 2,
-            },  # a choice of the user's, which plays no part
+            # a choice of the user's, which plays no part
+            "reference_integrator": {"type": "path", "max_depth": 2},
         }
     )
 
@@ -115,7 +113,7 @@ def test_equal_pictures_are_not_said_to_differ(tmp_path, monkeypatch):
     """
     Rationale: of many pictures that are right, hardly one may be told to be off because of noise.
     Expected: `path` beside itself, 16 samples a pixel: of forty comparisons at most two find a difference (three
-        standard errors, of five sizes of blocks). Beside `path` of another depth the error is found in each, within a
+        standard errors, of three sizes of blocks). Beside `path` of another depth the error is found in each, within a
         tenth of what many samples tell.
     Result: one of forty; 8.6 to 9.7%, and 9.1%.
     """
