@@ -16,7 +16,7 @@ from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.manylights.elements import Elements
 from mi_sparse_prt.manylights.render import RowColumn, Settings, find_view, matrix_of
 
-PIXELS = 800  # at which all lights are added up
+PIXELS = 2000  # at which all lights are added up
 SHARE = 0.005  # of the columns, that tell what all take
 
 

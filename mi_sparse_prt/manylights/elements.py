@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import sgemm
 
 from mi_sparse_prt.core.device_arrays import on_device
 from mi_sparse_prt.core.errors import PrtError
@@ -27,28 +28,66 @@ Ids = NDArray[np.integer]
 Done = Callable[[int], object]  # is told how many rows or columns more are done
 
 
+class SeenRows(NamedTuple):
+    """Rows that are known whole.
+
+    Attributes
+    ----------
+    ids : (r,) int64
+    weights : (r,) float64
+        By which elements of each are multiplied.
+    sums : (parts, r, 3) float64
+        Of the elements of each row and each part of the lights, multiplied.
+    """
+
+    ids: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    sums: NDArray[np.float64]
+
+    def and_others(self, more: SeenRows) -> SeenRows:
+        """These, and then those."""
+        ids, weights = np.append(self.ids, more.ids), np.append(self.weights, more.weights)
+        return SeenRows(ids, weights, np.concatenate([self.sums, more.sums], axis=1))
+
+
 class ReducedColumns(NamedTuple):
     """Columns of some rows ([HPB07] 3.2), one for each light.
 
     Attributes
     ----------
     projected : (n, r') float32
-        2-norms of RGB, projected.
+        2-norms of RGB, projected; in Fortran's order.
     norms : (n,) float64
         Of the columns before that.
     channel_norms : (n, 3) float64
-        Of each channel.
+        Of each channel; (n, 0) where nobody asks for them.
+    seen : SeenRows, optional
+        The rows; none where they are those of several views.
     """
 
     projected: Floats
     norms: NDArray[np.float64]
     channel_norms: NDArray[np.float64]
+    seen: SeenRows | None = None
 
     def of_lights(self, ids: Ids) -> ReducedColumns:
         """The columns of some lights."""
-        return self._replace(
-            projected=self.projected[ids], norms=self.norms[ids], channel_norms=self.channel_norms[ids]
-        )
+        return ReducedColumns(self.projected[ids], self.norms[ids], self.channel_norms[ids])
+
+    def of_part(self, part: int) -> ReducedColumns:
+        """Rows as one part of the lights is seen by them."""
+        seen = self.seen
+        return self._replace(seen=seen and seen._replace(sums=seen.sums[part : part + 1]))
+
+
+class Representatives(NamedTuple):
+    """A column of each cluster: (c,) int64, and what it is multiplied with: (c, 3) float32.
+
+    Or several sets of them, (sets, c) and (sets, c, 3): see ``Elements.sum_columns``.
+    """
+
+    ids: NDArray[np.int64]
+    weights: Floats
 
 
 class _Chosen(NamedTuple):
@@ -99,13 +138,19 @@ class Elements:
         PrtError
             One is not finite.
         """
-        found = np.zeros((len(rows), len(columns), 3), np.float32)
-        step = max(1, LANES // max(len(columns), 1))
-        for a in range(0, len(rows) if len(columns) else 0, step):
-            part = np.asarray(rows[a : a + step])
-            values = self.pairs(np.repeat(part, len(columns)), np.tile(columns, len(part)))
-            found[a : a + step] = values.reshape(len(part), len(columns), 3)
-        return found
+        rows, columns, k = np.asarray(rows), np.asarray(columns), len(columns)
+        found = np.zeros((3, len(rows), k), np.float32)
+        i, j = (on_device(mi.UInt32, ids.astype(np.uint32)) for ids in (rows, columns))
+        step, width = max(1, LANES // max(k, 1)), dr.opaque(mi.UInt32, max(k, 1))
+        for a in range(0, len(rows) if k else 0, step):
+            part = rows[a : a + step]
+            lane = dr.arange(mi.UInt32, len(part) * k)
+            row = dr.gather(mi.UInt32, i, lane // width + dr.opaque(mi.UInt32, a))
+            value = self._values(row, dr.gather(mi.UInt32, j, lane % width))
+            found[:, a : a + step] = value.numpy().reshape(3, len(part), k)
+        values = np.moveaxis(found, 0, 2)
+        self._check(values, rows[:, None], columns)
+        return values
 
     def pairs(self, rows: Ids, columns: Ids) -> Floats:
         """Elements (k, 3), one for each pair of a row and a column.
@@ -116,11 +161,14 @@ class Elements:
             One is not finite.
         """
         i, j = (on_device(mi.UInt32, np.asarray(ids, np.uint32)) for ids in (rows, columns))
-        value = self.element(self.samples.receivers(i), self.lights.arrays.take(j), mi.Mask(True))
-        found = np.ascontiguousarray(value.numpy().T)
-        self.evaluated += len(found)
+        found = np.ascontiguousarray(self._values(i, j).numpy().T)
         self._check(found, np.asarray(rows), np.asarray(columns))
         return found
+
+    def _values(self, rows: mi.UInt32, columns: mi.UInt32) -> mi.Color3f:
+        self.evaluated += dr.width(rows)
+        light = self.lights.arrays.take(columns)
+        return self.element(self.samples.receivers(rows), light, mi.Mask(True))
 
     def rows(self, ids: Ids) -> Floats:
         """Whole rows (len(ids), n, 3)."""
@@ -207,7 +255,14 @@ class Elements:
         self.evaluated += len(rows) * total
         return squares
 
-    def reduce_columns(self, rows: Ids, projection: Floats, done: Done = lambda _: None) -> ReducedColumns:
+    def reduce_columns(
+        self,
+        rows: Ids,
+        projection: Floats,
+        done: Done = lambda _: None,
+        weights: NDArray[np.float64] | None = None,
+        parts: Ids | None = None,
+    ) -> ReducedColumns:
         """All columns at some rows, projected as soon as they are known ([HPB07] 4).
 
         Parameters
@@ -215,31 +270,39 @@ class Elements:
         rows : (r,) integers
         projection : (r, r') float32
         done : callable
+        weights : (r,) float64, optional
+            By which elements of each row are multiplied; 1 if not given.
+        parts : (n,) integers, optional
+            From 0, of each light: sums of rows are those of each part. All are in one if not given.
 
         Raises
         ------
         PrtError
             An element is not finite: sample and light are named.
         """
-        n = len(self.lights)
-        projected = np.zeros((n, projection.shape[1]), np.float32)
+        n, weights = len(self.lights), np.ones(len(rows)) if weights is None else weights
+        projected = np.zeros((n, projection.shape[1]), np.float32, order="F")  # so that BLAS adds to it
+        sums = _PartSums(parts, n, len(rows))
         squares = [dr.zeros(mi.Float, n) for _ in range(3)]
         if n and len(rows):
             receivers = self.samples.receivers(on_device(mi.UInt32, np.asarray(rows, np.uint32)))
+            receivers.weight *= on_device(mi.Float, weights.astype(np.float32))
             dr.eval(receivers)
         step = max(1, LANES // max(n, 1) // ROWS) * ROWS
         for a in range(0, len(rows) if n else 0, step):
             count = min(step, len(rows) - a)
-            norms, squares = self._norms(receivers, a, count, squares)
+            values, norms, squares = self._norms(receivers, a, count, squares)
             block = norms.numpy().reshape(count, n)
             self._check_rows(block, np.asarray(rows)[a : a + count])
+            sums.add(a, values.numpy().reshape(3, count, n))
             for b in range(0, count, ROWS):
                 own = slice(b, min(b + ROWS, count))
-                projected += block[own].T @ projection[a + own.start : a + own.stop]
+                add_product(block[own].T, projection[a + own.start : a + own.stop], projected)
             done(count)
         self.evaluated += n * len(rows)
         channels = np.stack([square.numpy() for square in squares], axis=1).astype(np.float64)
-        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels))
+        seen = SeenRows(np.asarray(rows, np.int64), weights, sums.found)
+        return ReducedColumns(projected, np.sqrt(channels.sum(axis=1)), np.sqrt(channels), seen)
 
     def element(self, at: Receivers, light: LightArrays, active: mi.Mask) -> mi.Color3f:
         """Radiance of one light at one sample in each lane."""
@@ -341,24 +404,26 @@ class Elements:
     @dr.syntax
     def _norms(
         self, receivers: Receivers, first: int, count: int, squares: list[mi.Float]
-    ) -> tuple[mi.Float, list[mi.Float]]:
-        """A lane for each light, some samples one after the other: norms (count * n), and squares added to (n,)."""
+    ) -> tuple[mi.Color3f, mi.Float, list[mi.Float]]:
+        """A lane for each light, some samples one after the other: elements and norms (count * n), squares (n,)."""
         n = len(self.lights)
         lane = dr.arange(mi.UInt32, n)
         light = self.lights.arrays.take(lane)
-        norms, columns = dr.zeros(mi.Float, n * count), dr.opaque(mi.UInt32, n)
+        values, norms = dr.zeros(mi.Color3f, n * count), dr.zeros(mi.Float, n * count)
+        columns = dr.opaque(mi.UInt32, n)
         x, y, z = (mi.Float(square) for square in squares)
         k, row = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, first)
         last = dr.opaque(mi.UInt32, count)
         while k < last:
             value = self.element(receivers.take(row + k), light, mi.Mask(True))
+            dr.scatter(values, value, k * columns + lane)
             dr.scatter(norms, dr.norm(value), k * columns + lane)
             x += dr.square(value.x)
             y += dr.square(value.y)
             z += dr.square(value.z)
             k += 1
-        dr.eval(norms, x, y, z)
-        return norms, [x, y, z]
+        dr.eval(values, norms, x, y, z)
+        return values, norms, [x, y, z]
 
     def _chosen(self, ids: Ids, weights: Floats) -> _Chosen:
         """For all samples, those of a set after each other, so that neighbours ask for the same light."""
@@ -375,8 +440,8 @@ class Elements:
         return found
 
     def _check_sum(self, found: Floats, columns: Ids, rows: Ids | None = None) -> None:
-        bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
-        if len(bad):
+        if not np.isfinite(found).all():
+            bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
             self.block(bad[:1] if rows is None else rows[bad[:1]], columns)  # names it
 
     def _check_rows(self, norms: Floats, rows: Ids) -> None:
@@ -385,12 +450,40 @@ class Elements:
             self.block(rows[bad[:1]], np.flatnonzero(~np.isfinite(norms[bad[0]])))
 
     def _check(self, values: Floats, rows: Ids, columns: Ids) -> None:
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(bad):
-            i, j = int(rows[bad[0]]), int(columns[bad[0]])
-            raise PrtError(
-                f"{self.samples.name(i)} reflects light that is not finite of {self.lights.name(j)}: repair its BSDF"
-            )
+        if np.isfinite(values).all():
+            return
+        bad = tuple(np.argwhere(~np.isfinite(values).all(axis=-1))[0])
+        i, j = (int(np.broadcast_to(ids, values.shape[:-1])[bad]) for ids in (rows, columns))
+        raise PrtError(
+            f"{self.samples.name(i)} reflects light that is not finite of {self.lights.name(j)}: repair its BSDF"
+        )
+
+
+def add_product(a: Floats, b: Floats, total: Floats) -> None:
+    """Add a @ b to an array in Fortran's order, without copies."""
+    if total.size:
+        sgemm(1.0, a, b, beta=1.0, c=total, overwrite_c=True)
+
+
+class _PartSums:
+    """Sums of rows (parts, rows, 3), block by block; lights are in parts, or all in one."""
+
+    def __init__(self, parts: Ids | None, n: int, rows: int) -> None:
+        self._order = None if parts is None else np.argsort(parts, kind="stable")
+        sizes = np.array([n]) if parts is None else np.bincount(parts)
+        self._own = np.flatnonzero(sizes)
+        self._starts = (np.cumsum(sizes) - sizes)[self._own]
+        self.found = np.zeros((len(sizes), rows, 3))
+
+    def add(self, first: int, values: Floats) -> None:
+        """Of a block of rows (3, count, n)."""
+        channels, count, n = values.shape
+        if self._order is None:
+            sums = values.sum(axis=2)
+        else:
+            sums = np.add.reduceat(values[..., self._order], self._starts, axis=2)
+        found = sums.reshape(channels, count, len(self._own)).transpose(2, 1, 0)
+        self.found[self._own, first : first + count] = found
 
 
 def _pieces(count: int, size: int) -> Iterator[tuple[mi.UInt32, int]]:

@@ -9,7 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_sparse_prt.manylights.elements import Done, Elements, Floats, ReducedColumns
+from mi_sparse_prt.manylights.calibration import calibrate
+from mi_sparse_prt.manylights.elements import (
+    Done,
+    Elements,
+    Floats,
+    ReducedColumns,
+    Representatives,
+    SeenRows,
+)
 from mi_sparse_prt.sampling.row_column import cluster_columns, cluster_costs, with_lengths
 
 DEFENSIVE = 0.1  # of the mean norm, added to all of them: columns may be brighter than rows say
@@ -47,16 +55,6 @@ class Partition:
         drawing = np.zeros(lights)
         drawing[ids] = self.drawing
         return Partition([ids[own] for own in self.clusters], drawing, self.costs)
-
-
-class Representatives(NamedTuple):
-    """A column of each cluster: (c,) int64, and what it is multiplied with: (c, 3) float32.
-
-    Or several sets of them, (sets, c) and (sets, c, 3): see ``Elements.sum_columns``.
-    """
-
-    ids: Ids
-    weights: Floats
 
 
 class Estimate(NamedTuple):
@@ -125,7 +123,7 @@ def _partition(
     reduced: ReducedColumns, ids: Ids, drawing: Doubles, count: int, rng: np.random.Generator
 ) -> Partition:
     norms = reduced.norms[ids]
-    x = with_lengths(reduced.projected[ids], norms)
+    x = with_lengths(np.ascontiguousarray(reduced.projected[ids]), norms)
     clusters = cluster_columns(x, norms, count, rng)
     return Partition([ids[own] for own in clusters], drawing, cluster_costs(x, norms, clusters))
 
@@ -174,7 +172,12 @@ def _drawn(weights: Doubles, members: Ids, u: Doubles) -> tuple[Ids, Doubles]:
 
 
 def sum_with_error(
-    elements: Elements, partition: Partition, sets: int, rng: np.random.Generator, done: Done = lambda _: None
+    elements: Elements,
+    partition: Partition,
+    sets: int,
+    rng: np.random.Generator,
+    done: Done = lambda _: None,
+    seen: SeenRows | None = None,
 ) -> Estimate:
     """The sum of all columns by representatives of each cluster, and the expected error.
 
@@ -187,10 +190,14 @@ def sum_with_error(
     rng : np.random.Generator
     done : callable
         Is told how many columns more are done.
+    seen : SeenRows, optional
+        Whose first sums are those of all lights of the partition: weights are calibrated by them. Without, the
+        estimate has no bias.
     """
     first, second = (draw_representatives(partition, sets, rng) for _ in range(2))
-    values = elements.sum_columns(first.ids, first.weights, done)
-    return Estimate(values, _squared_error(elements, partition, first, second, rng))
+    ours, left = calibrate(elements, seen, first) if seen is not None else (first, 1.0)
+    values = elements.sum_columns(ours.ids, ours.weights, done)
+    return Estimate(values, left * _squared_error(elements, partition, first, second, rng))
 
 
 def _squared_error(

@@ -20,7 +20,7 @@ from mi_sparse_prt.core.random_keys import random_stream
 from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.core.variant import check_variant
 from mi_sparse_prt.manylights.compensation import PATHS, SURVEY, LeftOut, joined, trace_left_out
-from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns
+from mi_sparse_prt.manylights.elements import Elements, Floats, ReducedColumns, Representatives
 from mi_sparse_prt.manylights.estimate import (
     PIXELS,
     SECOND,
@@ -28,12 +28,14 @@ from mi_sparse_prt.manylights.estimate import (
     Partition,
     defensive_partition,
     draw_coloured_representatives,
+    draw_representatives,
     published_partition,
     sum_with_error,
 )
 from mi_sparse_prt.manylights.image import ManyLightsImage, relative_error
 from mi_sparse_prt.manylights.lights import LightOptions, scene_lights
 from mi_sparse_prt.manylights.samples import Samples
+from mi_sparse_prt.manylights.suggested_rows import LOOKED_AT, MOST_COLUMNS, reduce_columns
 from mi_sparse_prt.manylights.surfaces import Surfaces
 from mi_sparse_prt.sampling.row_column import random_projection
 from mi_sparse_prt.scene.loading import load_mitsuba
@@ -47,7 +49,7 @@ ROWS_SHARE = 0.2  # of what columns cost, that rows may, where these are cheap: 
 FEWEST = 16, 48  # rows and columns
 FIRST = 50  # rows, where an error is asked for
 GROWTH = 1.5, 4.0  # of rows and columns from one try to the next: the error falls about as they grow
-_PROJECT, _CLUSTER, _DRAW = range(3)  # keys of random numbers
+_PROJECT, _CLUSTER, _DRAW, _, _SUGGEST = range(5)  # keys of random numbers; frames have one
 
 PILOT = 16  # rows, and columns, that tell what others cost
 CLUSTERING = 7e-9  # seconds for each light and cluster
@@ -256,7 +258,10 @@ class RowColumn:
                 self.elements.sum_columns(columns, weights)
                 took.append((middle - start, time.perf_counter() - middle))
         row, column = (seconds / PILOT for seconds in took[-1])
-        return Costs(row, column * (1 + 2 * SECOND * PIXELS), CLUSTERING * len(self.lights))
+        more, clustered = (
+            (0.0, 1) if self.settings.method == "hasan2007" else (2 * SECOND * PIXELS + LOOKED_AT, 2)
+        )
+        return Costs(row, column * (1 + more), clustered * CLUSTERING * len(self.lights))
 
     def forecast(self, costs: Costs) -> float:
         """Seconds that rows, clustering and columns will take."""
@@ -276,11 +281,20 @@ class RowColumn:
         return float(np.clip(n / (ROWS_SHARE * m), *COLUMNS_PER_ROW))
 
     def reduced(self, rows: int) -> ReducedColumns:
-        """Reduced columns of so many rows."""
-        ids = self.samples.stratified_rows(rows, self.settings.seed)
-        projection = random_projection(len(ids), PROJECTED, self.settings.random(_PROJECT))
-        with self.run.clock.phase("rows"), self.run.bar(len(ids), "rows") as bar:
-            return self.elements.reduce_columns(ids, projection, bar.update)
+        """Reduced columns of so many rows: at even distances, or half of them where columns suggest them."""
+        rows, seed = min(rows, len(self.samples)), self.settings.seed
+        projection = random_projection(rows, PROJECTED, self.settings.random(_PROJECT))
+        with self.run.clock.phase("rows"), self.run.bar(rows, "rows") as bar:
+            if self.settings.method == "hasan2007":
+                ids = self.samples.stratified_rows(rows, seed)
+                return self.elements.reduce_columns(ids, projection, bar.update)
+            parts = self.lights.group.astype(np.int64) if self.settings.groups else None
+            return reduce_columns(self.elements, projection, self._suggesting, seed, bar.update, parts)
+
+    def _suggesting(self, reduced: ReducedColumns) -> Representatives:
+        """Columns that suggest rows."""
+        partition = self.partition(reduced, min(self.columns, MOST_COLUMNS))
+        return draw_representatives(partition, 1, self.settings.random(_SUGGEST))
 
     def partition(
         self, reduced: ReducedColumns, columns: int, ids: NDArray[np.int64] | None = None
@@ -308,13 +322,14 @@ class RowColumn:
         return defensive_partition(reduced, flux, columns, rng)
 
     def summed(self, reduced: ReducedColumns, partition: Partition) -> Estimate:
-        """The sum of all columns by those that represent their clusters."""
+        """The sum of all columns by those that represent their clusters, all of which are in it."""
         rng = self.settings.random(_DRAW)
         with self.run.clock.phase("columns"), self.run.bar(len(partition), "columns", " columns") as bar:
             if self.settings.method == "hasan2007":
                 chosen = draw_coloured_representatives(partition, reduced.channel_norms, rng)
                 return Estimate(self.elements.sum_columns(*chosen, bar.update), float("nan"))
-            return sum_with_error(self.elements, partition, self.settings.spp, rng, bar.update)
+            spp, seen = self.settings.spp, reduced.seen
+            return sum_with_error(self.elements, partition, spp, rng, bar.update, seen)
 
     def trace_left_out(self) -> None:
         """Light that the matrix does not have: of all samples, if it is to be added, else of some, to tell how much."""
@@ -402,7 +417,7 @@ class RowColumn:
             if len(ids):
                 share = reduced.norms[ids].sum() / max(reduced.norms.sum(), 1e-300)
                 partition = self.partition(reduced, max(1, round(share * self.columns)), ids)
-                found.append(self.summed(reduced, partition))
+                found.append(self.summed(reduced.of_part(group), partition))
                 self.layers[name], columns = found[-1].values, columns + len(partition)
         self.columns = columns
         values = np.asarray(sum(one.values for one in found), np.float32)

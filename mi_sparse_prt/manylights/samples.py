@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -202,9 +203,15 @@ class Samples:
         rng : np.random.Generator
         """
         pixel = self.ids // self.spp
-        every = np.unique(pixel)
+        every = pixel[np.flatnonzero(np.diff(pixel, prepend=-1))]  # ascending, as rows are
         chosen = rng.choice(every, min(count, len(every)), replace=False)
         return np.flatnonzero(np.isin(pixel, chosen)), len(every) / max(len(chosen), 1)
+
+    @cached_property
+    def _along_curve(self) -> NDArray[np.int64]:
+        y, x = np.divmod(self.ids // self.spp, self.shape[1])
+        place = np.stack([x, y, np.zeros_like(x)], axis=1)
+        return morton_order(place, np.arange(len(self), dtype=np.uint64))
 
     def stratified_rows(self, count: int, seed: int) -> NDArray[np.int64]:
         """Rows in blocks of the image, one at random in each ([HPB07] 4): as many pieces of a curve through the pixels.
@@ -219,10 +226,7 @@ class Samples:
         (min(count, m),) int64
             Ascending along the curve.
         """
-        y, x = np.divmod(self.ids // self.spp, self.shape[1])
-        place = np.stack([x, y, np.zeros_like(x)], axis=1)
-        order = morton_order(place, np.arange(len(self), dtype=np.uint64))
-        count = min(count, len(self))
+        order, count = self._along_curve, min(count, len(self))
         u = np.random.default_rng([seed, _CAMERA]).random(count)
         at = ((np.arange(count) + u) * (len(self) / max(count, 1))).astype(np.int64)
         return order[np.minimum(at, len(self) - 1)]

@@ -134,6 +134,26 @@ def test_reduced_columns_are_norms_of_colours_projected(matrix: Elements, whole:
     assert found.projected == pytest.approx(expected.projected @ projection, rel=1e-4, abs=1e-5)
     assert found.norms == pytest.approx(expected.norms, rel=1e-5)
     assert found.channel_norms == pytest.approx(expected.channel_norms, rel=1e-5)
+    assert found.seen is not None
+    assert found.seen.sums[0] == pytest.approx(whole[rows].sum(axis=1), rel=1e-5)
+
+
+def test_reduced_columns_of_weighted_rows_by_parts_of_the_lights(matrix: Elements, whole: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    rows, weights = rng.choice(len(whole), 40, replace=False), rng.uniform(0.1, 3, 40)
+    parts = rng.choice([0, 1, 3], whole.shape[1])  # none of the third
+    projection = rng.normal(size=(40, 5)).astype(np.float32)
+    weighted = whole.copy()
+    weighted[rows] *= weights[:, None, None]
+    found = matrix.reduce_columns(rows, projection, weights=weights, parts=parts)
+    expected = reduced_from(weighted, rows)
+    assert found.projected == pytest.approx(expected.projected @ projection, rel=1e-4, abs=1e-5)
+    assert found.norms == pytest.approx(expected.norms, rel=1e-5)
+    assert found.seen is not None and np.array_equal(found.seen.weights, weights)
+    for part in range(4):
+        own = found.of_part(part).seen
+        assert own is not None
+        assert own.sums[0] == pytest.approx(weighted[rows][:, parts == part].sum(axis=1), rel=1e-5, abs=1e-9)
 
 
 @pytest.mark.parametrize("method", ["adaptive", "hasan2007"])
