@@ -21,7 +21,7 @@ Columns = NDArray[Any]  # float32 or float64
 Doubles = NDArray[np.float64]
 
 BY_SAMPLING = 2 / 3  # of the clusters; the others are made by splitting ([HPB07] 3.5)
-DISTANCES = 1 << 22  # that are in memory at a time
+DISTANCES = 1 << 18  # at a time, so that they stay in the cache
 
 
 def random_projection(rows: int, dimensions: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -101,15 +101,14 @@ def draw_distinct(p: Doubles, count: int, rng: np.random.Generator) -> tuple[Ids
 
 def nearest_centre(x: Columns, norms: Doubles, centres: Ids, weights: Doubles) -> Ids:
     """Which centre (n,) each column is nearest to; distances are ``n_K^T n_R - K^T R`` times weights, in blocks."""
-    owner = np.empty(len(x), np.int64)
-    scaled = x[centres].T, norms[centres].astype(x.dtype), weights.astype(x.dtype)
-    own = norms.astype(x.dtype)
+    owner, own, scale = np.empty(len(x), np.int64), norms.astype(x.dtype), weights.astype(x.dtype)
+    directions, lengths = (x[centres] * scale[:, None]).T, own[centres] * scale
     step = max(1, DISTANCES // max(len(centres), 1))
     for a in range(0, len(x), step):
         part = slice(a, a + step)
-        distance = own[part, None] * scaled[1] - x[part] @ scaled[0]  # [column, centre]
+        distance = own[part, None] * lengths  # [column, centre]
+        distance -= x[part] @ directions
         np.maximum(distance, 0, out=distance)
-        distance *= scaled[2]
         owner[part] = np.argmin(distance, axis=1)
     return owner
 
