@@ -144,11 +144,13 @@ def cluster_costs(x: Columns, norms: Doubles, clusters: list[Ids]) -> Doubles:
     return found
 
 
-def costs_of_first(x: Columns, norms: Doubles) -> Doubles:
-    """Costs (n,) of the clusters of the first 1, 2, ..., n columns."""
-    sums = np.cumsum(x, axis=0, dtype=np.float64)
-    cost = np.cumsum(norms, dtype=np.float64) ** 2 - (sums**2).sum(axis=1)
-    return np.maximum(np.asarray(cost, np.float64), 0)
+def costs_of_cuts(x: Columns, norms: Doubles) -> tuple[Doubles, Doubles]:
+    """Costs (n - 1,) of the clusters of the first 1, 2, ... of n columns, and of those of all others."""
+    sums, lengths = np.cumsum(x, axis=0, dtype=np.float64), np.cumsum(norms, dtype=np.float64)
+    squares = np.einsum("ij,ij->i", sums, sums)
+    others = squares[-1] - 2 * (sums @ sums[-1]) + squares
+    first, last = lengths**2 - squares, (lengths[-1] - lengths) ** 2 - others
+    return np.maximum(first, 0)[:-1], np.maximum(last, 0)[:-1]
 
 
 def split_cluster(x: Columns, norms: Doubles, members: Ids, rng: np.random.Generator) -> tuple[Ids, Ids]:
@@ -165,8 +167,7 @@ def _cut(
     np.divide(along, lengths, out=along, where=lengths > 0)  # where some are zero, for all that matters
     order = np.argsort(along, kind="stable")
     own, lengths = own[order], lengths[order]
-    before = costs_of_first(own, lengths)[:-1]
-    after = costs_of_first(own[::-1], lengths[::-1])[:-1][::-1]
+    before, after = costs_of_cuts(own, lengths)
     best = int(np.argmin(before + after))
     ordered = members[order]
     return (ordered[: best + 1], ordered[best + 1 :]), (float(before[best]), float(after[best]))

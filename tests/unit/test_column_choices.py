@@ -35,7 +35,7 @@ from mi_sparse_prt.core.run import Run
 from mi_sparse_prt.methods.dense_sampling import DenseSampler
 from mi_sparse_prt.methods.huang2010 import Huang2010Options
 from mi_sparse_prt.sampling.angular import AngularGrid
-from mi_sparse_prt.sampling.row_column import costs_of_first, draw_distinct, split_cluster
+from mi_sparse_prt.sampling.row_column import costs_of_cuts, draw_distinct, split_cluster
 from mi_sparse_prt.solvers.direct_rays import DirectSolver
 
 RESOLUTION, VERTICES = 8, 40
@@ -121,8 +121,9 @@ def test_costs_are_sums_over_pairs() -> None:
     x = np.random.default_rng(0).random((7, 4))
     norms = np.linalg.norm(x, axis=1)
     pairs = norms[:, None] * norms - x @ x.T
-    expected = [pairs[:k, :k].sum() for k in range(1, 8)]
-    assert costs_of_first(x, norms) == pytest.approx(expected, abs=1e-12)
+    first, last = costs_of_cuts(x, norms)
+    assert first == pytest.approx([pairs[:k, :k].sum() for k in range(1, 7)], abs=1e-12)
+    assert last == pytest.approx([pairs[k:, k:].sum() for k in range(1, 7)], abs=1e-12)
 
 
 def test_a_cluster_is_cut_at_the_best_place() -> None:
