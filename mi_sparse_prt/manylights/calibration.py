@@ -54,11 +54,11 @@ def calibrate(elements: Elements, seen: SeenRows, drawn: Representatives) -> Cal
     """
     some = slice(None, None, -(-len(seen.ids) // MOST_ROWS))
     every, place = np.unique(drawn.ids, return_inverse=True)
-    scale = seen.weights[some, None, None] / len(drawn.ids)
-    block = elements.block(seen.ids[some], every) * scale
+    block, scale = elements.block(seen.ids[some], every), seen.weights[some, None] / len(drawn.ids)
     weights, before, after = drawn.weights.reshape(-1, 3).astype(np.float64), 0.0, 0.0
     for channel in range(3):
-        own = block[:, place.ravel(), channel] * weights[:, channel]  # what each adds to rows
+        own = block[:, place.ravel(), channel] * weights[:, channel]
+        own *= scale  # what each adds to rows
         missing = seen.sums[0, some, channel] - own.sum(axis=1)
         change, left = _ridge(own, missing)
         weights[:, channel] *= 1 + change

@@ -109,7 +109,7 @@ def suggested_rows(
     columns, whose errors add up, it is the root of the sum of their squared shares, each times the column's energy.
     """
     samples = elements.samples
-    looked_at = max(min(round(LOOKED_AT * len(samples)), MOST_LOOKED_AT), 4 * count)
+    looked_at = max(min(max(round(LOOKED_AT * len(samples)), 4 * count), MOST_LOOKED_AT), 2 * count)
     others = np.setdiff1d(samples.stratified_rows(looked_at, seed), first)
     every = np.append(first, others)
     wanted = bright_places(elements, every, columns)
