@@ -56,7 +56,7 @@ class ReducedColumns(NamedTuple):
     Attributes
     ----------
     projected : (n, r') float32
-        2-norms of RGB, projected; in Fortran's order.
+        2-norms of RGB, projected; in C's or Fortran's order.
     norms : (n,) float64
         Of the columns before that.
     channel_norms : (n, 3) float64

@@ -22,9 +22,7 @@ from mi_sparse_prt.manylights.elements import (
 )
 
 FIRST_SHARE = 0.5  # of the rows are at even distances,
-MOST_FIRST = (
-    250  # but no more than so many: their elements are kept until it is known what each row counts for
-)
+MOST_FIRST = 250  # but no more: their elements are kept until it is known what each row counts for
 MOST_COLUMNS = 300  # that suggest rows
 LOOKED_AT = 1 / 64  # of the samples: as many elements as a 64th of all columns,
 MOST_LOOKED_AT = 20_000  # so that these are in memory
